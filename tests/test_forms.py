@@ -1,0 +1,195 @@
+"""Compiled forms: what they are integrated on, with which quadrature, and what is refused."""
+
+import dataclasses
+import re
+from collections.abc import Callable
+
+import basix.ufl
+import numpy as np
+import pytest
+from ufl import div, dx, exp, grad, inner, sin
+
+import ufl
+from thccs_fem import element, fem, generators
+from thccs_fem.fem.forms import Form
+from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.mesh import ControlMesh
+
+
+def tagged_mesh() -> ControlMesh:
+    """Return a grid of 3 x 3 unit squares with tags 1, 2, 2, 0, ... in the order of the faces."""
+    msh = generators.rectangle((3, 3))
+    tags = [1, 2, 2, 0, 0, 0, 0, 0, 0]
+    return ControlMesh(msh.vertices, msh.quads, face_tags=tags)
+
+
+MESH = tagged_mesh()
+V = fem.functionspace(MESH, ("THCCS", 3))
+W = fem.functionspace(MESH, ("THCCS", 3, (2,)))
+u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+w = fem.Function(V, name="w")
+x = ufl.SpatialCoordinate(MESH)
+
+
+def refined(space: FunctionSpace, dofs: list[int]) -> FunctionSpace:
+    return space.with_hierarchy(space.hierarchy.refined(np.array(dofs)))
+
+
+def degrees(form: Form) -> list[int]:
+    return [integral.metadata()["quadrature_degree"] for integral in form.ufl_form.integrals()]
+
+
+# ---- Quadrature
+
+
+@pytest.mark.parametrize(
+    ("integrand", "degree"),
+    [
+        (u * v, 7),
+        (inner(grad(u), grad(v)), 7),
+        (div(grad(u)) * div(grad(v)), 7),
+        (v, 7),
+        (sin(x[0]) * v, 7),  # a given function of x does not count: the geometry's degree would make it 8
+        ((w - exp(x[0])) ** 2, 7),
+        (w * u * v, 9),
+        (w**2 * v, 9),
+        (w**5 * v, 11),
+        (ufl.derivative(w**2 * v, w, u), 9),
+    ],
+    ids=str,
+)
+def test_quadrature_degree_is_that_on_a_parallelogram_within_bounds(integrand: ufl.core.expr.Expr, degree: int) -> None:
+    assert degrees(fem.form(integrand * dx)) == [degree]
+
+
+def test_quadrature_degree_of_the_user_is_kept() -> None:
+    form = fem.form(u * v * dx(metadata={"quadrature_degree": 3}) + w * u * v * dx, quadrature_degree=5)
+    assert sorted(degrees(form)) == [3, 5]
+    assert degrees(fem.form(u * v * dx(metadata={"quadrature_rule": "GLL"}))) == [7]
+
+
+def test_quadrature_points_of_the_user_are_kept() -> None:
+    rule = {
+        "quadrature_rule": "custom",
+        "quadrature_points": np.array([[0.5, 0.5]]),
+        "quadrature_weights": np.array([1.0]),
+    }
+    form = fem.form(x[0] ** 2 * dx(domain=MESH, metadata=rule))
+    midpoints = (np.arange(3) + 0.5) / 3
+    # On the unit square the map of each cell is affine: the midpoint rule is what it is called.
+    assert fem.assemble_scalar(form) == pytest.approx((midpoints**2).sum() / 3, rel=1e-13)
+
+
+# ---- What is in a form
+
+
+def test_form_knows_its_functions_in_the_order_of_the_kernels() -> None:
+    f, g = fem.Function(V, name="f"), fem.Function(V, name="g")
+    c, d = fem.Constant(MESH, [1.0, 2.0]), fem.Constant(MESH, 3.0)
+    # Differentiation drops f, the first of three.
+    form = fem.form(ufl.derivative(d * f * g * w * c[1] * dx, f, v))
+    assert set(form.ufl_form.coefficients()) == {f, g, w}
+    assert set(form.coefficients) == {g, w}
+    assert form.constants == (c, d)
+    assert form.spaces == (V,)
+    assert (form.rank, form.mesh, form.cells, form.transfers) == (1, MESH, V.cells, {})
+
+
+def test_integrals_know_their_tags_and_coefficients() -> None:
+    f = fem.Function(V)
+    form = fem.form(f * v * dx(2) + w * v * dx + v * dx((0, 1)))
+    used = {integral.tag: [c for c, reads in zip(form.coefficients, integral.reads, strict=True) if reads] for integral in form.integrals}
+    assert used == {None: [w], 0: [], 1: [], 2: [f]}
+
+
+def test_compiled_form_is_returned_as_it_is() -> None:
+    form = fem.form(v * dx)
+    assert fem.form(form) is form
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        form.module = None
+
+
+def test_form_without_functions_is_on_level_0_of_its_mesh() -> None:
+    form = fem.form(1.0 * dx(domain=MESH))
+    assert (form.rank, form.mesh, form.cells.num_cells) == (0, MESH, 9)
+    assert fem.assemble_scalar(form) == pytest.approx(1.0, rel=1e-14)
+
+
+def test_form_without_functions_keeps_its_mesh() -> None:
+    form = fem.form(1.0 * dx(domain=generators.rectangle((2, 2)).ufl_domain()))  # no other reference to that mesh
+    assert fem.assemble_scalar(form) == pytest.approx(1.0, rel=1e-14)
+
+
+# ---- Cells of the finest hierarchy
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_cells_are_those_of_the_finest_space(order: int) -> None:
+    fine = refined(V, [V.num_dofs // 2])
+    spaces = (V, fine) if order == 0 else (fine, V)
+    form = fem.form(ufl.TestFunction(spaces[0]) * fem.Function(spaces[1]) * dx)
+    assert form.cells is fine.cells
+    assert set(form.transfers) == {V.hierarchy}
+    assert form.transfers[V.hierarchy].shape == (fine.num_dofs, V.num_dofs)
+
+
+def test_equal_hierarchies_need_no_transfer() -> None:
+    again = fem.functionspace(MESH, ("THCCS", 3))
+    assert again.hierarchy is not V.hierarchy
+    assert fem.form(ufl.TestFunction(V) * fem.Function(again) * dx).transfers == {}
+
+
+def test_unrelated_refinements_are_refused_by_name() -> None:
+    large = fem.functionspace(generators.rectangle((8, 8)), ("THCCS", 3))
+    corner = np.argsort(large.reference_points.sum(axis=1))
+    one, other = refined(large, [corner[0]]), refined(large, [corner[-1]])
+    with pytest.raises(ValueError, match=r"none is a refinement of all the others:\n.*\n.*\n.*common refinement"):
+        fem.form(fem.Function(one) * fem.Function(other) * dx)
+
+
+def test_space_to_integrate_on_may_be_given() -> None:
+    fine = refined(V, [V.num_dofs // 2])
+    assert fem.form(w * dx, on=fine).cells is fine.cells
+    assert fem.form(1.0 * dx(domain=MESH), on=fine).cells is fine.cells
+
+
+# ---- Refused
+
+lagrange = ufl.FunctionSpace(MESH.ufl_domain(), basix.ufl.element("Lagrange", "quadrilateral", 3))
+other_mesh = ufl.Mesh(element.coordinate_element(2))
+ds, dS = ufl.ds(domain=MESH), ufl.dS(domain=MESH)
+
+REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
+    "no form": (lambda: u * v, TypeError, "form needs a sum of UFL integrals, got Product: is there a * ufl.dx missing?"),
+    "zero": (lambda: 0 * v * dx(domain=MESH), ValueError, "the form is zero.*fem.Constant(msh, 0.0) * v * ufl.dx"),
+    "rim": (lambda: v * ds, NotImplementedError, "an integral over ds (exterior_facet); only dx is implemented"),
+    "edges": (lambda: v("+") * dS, NotImplementedError, "an integral over dS (interior_facet)"),
+    "subdomain data": (lambda: v * dx(subdomain_data=[1]), ValueError, "the measure has subdomain_data; tags belong"),
+    "unknown tag": (lambda: v * dx(7), ValueError, "the form has dx(7), but tags are .* of the mesh: [0, 1, 2]"),
+    "unknown tag of two": (lambda: v * dx((1, 8)), ValueError, "the form has dx(8)"),
+    "negative tag": (lambda: v * dx(-1), ValueError, "the form has dx(-1), but tags are non-negative"),
+    "Lagrange argument": (lambda: ufl.TestFunction(lagrange) * dx, ValueError, "v_0 has the element .*(P, quadrilateral, 3"),
+    "Lagrange function": (lambda: ufl.Coefficient(lagrange) * v * dx, ValueError, "w_.* has the element .*fem.project"),
+    "no values": (lambda: ufl.Coefficient(V) * v * dx, TypeError, "is a Coefficient without values: use fem.Function(V)"),
+    "no value": (lambda: ufl.Constant(MESH) * v * dx, TypeError, "is a Constant without a value: use fem.Constant(msh"),
+    "cell size": (lambda: ufl.CellDiameter(MESH) * v * dx, ValueError, "the form has CellDiameter, .* hand the cell size in"),
+    "cell volume": (lambda: ufl.CellVolume(MESH) * v * dx, ValueError, "the form has CellVolume"),
+    "two meshes": (
+        lambda: fem.Function(fem.functionspace(generators.rectangle((2, 2)), ("THCCS", 3))) * v * dx(domain=MESH),
+        ValueError,
+        "the form has measures or functions on 2 meshes",
+    ),
+    "coordinates of another mesh": (
+        lambda: ufl.SpatialCoordinate(generators.rectangle((2, 2)))[0] * v * dx(domain=MESH),
+        ValueError,
+        "on 2 meshes",
+    ),
+    "other mesh": (lambda: 1.0 * dx(domain=other_mesh), ValueError, "not the domain of a control mesh"),
+}
+
+
+@pytest.mark.parametrize(("make", "error", "message"), REFUSED.values(), ids=REFUSED)
+def test_what_is_refused_is_named(make: Callable[[], object], error: type[Exception], message: str) -> None:
+    pattern = ".*".join(re.escape(part) for part in message.split(".*"))
+    with pytest.raises(error, match=pattern):
+        fem.form(make())

@@ -1,0 +1,60 @@
+"""Data flows one way: modules in order, each imports earlier ones alone."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LAYERS = """
+    thccs_fem thccs_fem.jit thccs_fem.element thccs_fem.mesh
+    thccs_fem.subdivision thccs_fem.boundary thccs_fem.bezier thccs_fem.limit thccs_fem.generators
+    thccs_fem.hierarchy thccs_fem.extraction
+    thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.forms thccs_fem.fem.assembly
+    thccs_fem.fem.bcs thccs_fem.fem thccs_fem.fem.scipy thccs_fem.fem.petsc
+    thccs_fem.estimate thccs_fem.adapt thccs_fem.io thccs_fem.plot
+""".split()
+PATHS = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in (ROOT / "thccs_fem").rglob("*.py")
+    if ROOT / "thccs_fem/forms" not in path.parents
+}
+
+
+def imports(path: Path) -> Iterator[str]:
+    """Yield every name that a file imports, under TYPE_CHECKING and inside functions too."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{'.' * node.level}{node.module}.{alias.name}" for alias in node.names)
+
+
+def module_of(name: str) -> str:
+    """Return the module of the package that an imported name is or is in."""
+    while name not in LAYERS:
+        name = name.rpartition(".")[0]
+    return name
+
+
+def test_every_module_has_its_layer() -> None:
+    assert sorted(PATHS) == sorted(LAYERS)
+
+
+@pytest.mark.parametrize("module", sorted(PATHS))
+def test_only_earlier_layers_are_imported(module: str) -> None:
+    earlier = LAYERS[: LAYERS.index(module)]
+    names = [name for name in imports(PATHS[module]) if name.startswith(("thccs_fem", "."))]
+    assert [name for name in names if name[0] == "." or module_of(name) not in earlier] == []
+
+
+@pytest.mark.parametrize("module", sorted(set(PATHS) - {"thccs_fem.fem.petsc"}))
+def test_petsc_and_mpi_stay_in_one_module(module: str) -> None:
+    roots = {name.partition(".")[0] for name in imports(PATHS[module])}
+    assert not roots & {"dolfinx", "mpi4py", "petsc4py", "slepc4py"}
+
+
+def test_forms_need_ufl_alone() -> None:
+    paths = sorted((ROOT / "forms").glob("*.py"))
+    assert {name.partition(".")[0] for path in paths for name in imports(path)} == {"ufl"}

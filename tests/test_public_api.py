@@ -1,0 +1,162 @@
+"""The names that others call, with the parameters that they may rely on."""
+
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import thccs_fem
+
+# What is promised of a parameter: its place, unless it comes after a star; its name, unless it
+# comes before a slash; its default, unless that is ANY. More parameters may follow, all with
+# defaults. Of what has "..." only the name is promised.
+ANY = inspect.Parameter.empty
+SIGNATURES = {
+    "mesh.ControlMesh": (
+        "vertices, faces, face_tags=None, edge_tags=None, creases=None, corners=None, comm=None"
+    ),
+    "mesh.ControlMesh.ufl_domain": "self",
+    "mesh.orient": "vertices, faces",
+    "generators.torus": "shape, /, R=2, r=1",
+    "generators.cube_sphere": "n",
+    "generators.genus3": "",
+    "generators.rectangle": "shape, /",
+    "generators.disc": "n",
+    "generators.wheel": "valence, n",
+    "generators.l_domain": "n=4",
+    "generators.l_domain1": "",
+    "generators.l_domain2": "",
+    "limit.evaluate": "msh, faces, uv, derivatives=ANY, corner=None",
+    "fem.functionspace": "msh, element, /, boundary=ANY",
+    "fem.FunctionSpace.sub": "self, component, /",
+    "fem.FunctionSpace.ufl_domain": "self",
+    "fem.Constant": "msh, value, /",
+    "fem.Function": "V, name=ANY",
+    "fem.Function.eval": "self, faces, uv, corner=None",
+    "fem.Expression": "expression, /",
+    "fem.project": "expression, V, /",
+    "fem.locate_dofs_geometrical": "V, marker",
+    "fem.boundary_dofs": "V, marker=None, *, tag=ANY",
+    "fem.region_dofs": "V, faces=ANY, *, tag=ANY",
+    "fem.dirichletbc": "value, dofs, V",
+    "fem.form": "ufl_form, /",
+    "fem.assemble_scalar": "form, /",
+    "fem.assemble_vector": "form, /",
+    "fem.assemble_matrix": "form, /",
+    "fem.scipy.LinearProblem": "a, L, *, bcs=(), petsc_options_prefix=ANY, petsc_options=None",
+    "fem.scipy.LinearProblem.solve": "self",
+    "fem.petsc.LinearProblem": "a, L, *, bcs=(), petsc_options_prefix=ANY, petsc_options=None",
+    "fem.petsc.LinearProblem.solve": "self",
+    "fem.petsc.NonlinearProblem": "...",
+    "fem.petsc.EigenProblem": "...",
+    "fem.petsc.multigrid": "...",
+    "fem.petsc.assemble_vector": "form, /",
+    "fem.petsc.apply_lifting": "b, a, bcs, /",
+    "fem.petsc.set_bc": "b, bcs, /",
+    "estimate.error": "uh, u_exact, norm='L2'",
+    "estimate.residual": "uh, strong_residual, neumann=None",
+    "estimate.bubble": "uh, a, L",
+    "estimate.norm": "V, eta",
+    "adapt.mark": "V, eta, strategy='dorfler', theta=0.5",
+    "adapt.refine": "V, marked",
+    "adapt.transfer": "uh, V2, /",
+    "io.read_mesh": "filename, /, comm=None",
+    "io.write_vtu": "filename, uh, /",
+    "plot.plot": "uh, filename=None",
+    "forms.laplace_beltrami.a": "u, v, kappa=1",
+    "forms.laplace_beltrami.L": "f, v",
+    "forms.laplace_beltrami.strong_residual": "u, f, kappa=1",
+    "forms.poisson.a": "u, v, kappa=1, c=0",
+    "forms.poisson.L": "f, v, g=None",
+    "forms.poisson.strong_residual": "u, f, kappa=1, c=0",
+}
+PACKAGES = pkgutil.walk_packages(thccs_fem.__path__, "thccs_fem.")
+MODULES = [found.name.removeprefix("thccs_fem.") for found in PACKAGES]
+NAMED = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def module(name: str) -> ModuleType:
+    """Import a module of the package; skip where it needs PETSc and there is none."""
+    if name == "fem.petsc":
+        pytest.importorskip("petsc4py")
+    return importlib.import_module(f"thccs_fem.{name}")
+
+
+def public(name: str) -> Callable[..., Any]:
+    """Return the function, class or method of a dotted name."""
+    parts = name.split(".")
+    depth = 2 if parts[0] == "forms" or parts[1] in {"petsc", "scipy"} else 1
+    found: Any = module(".".join(parts[:depth]))
+    for part in parts[depth:]:
+        found = getattr(found, part)
+    return found
+
+
+@pytest.mark.parametrize(("name", "documented"), SIGNATURES.items(), ids=SIGNATURES)
+def test_signature_is_the_documented_one(name: str, documented: str) -> None:
+    actual = inspect.signature(public(name)).parameters
+    if documented == "...":
+        return
+    promised = inspect.signature(eval(f"lambda {documented}: None", {"ANY": ANY})).parameters
+    in_place = list(actual.values())
+    kept = set()
+    for place, want in enumerate(promised.values()):
+        if want.kind is inspect.Parameter.KEYWORD_ONLY:
+            assert want.name in actual
+            have = actual[want.name]
+        else:
+            have = in_place[place]
+            assert have.kind is not inspect.Parameter.KEYWORD_ONLY
+        if want.kind is not inspect.Parameter.POSITIONAL_ONLY:
+            assert have.name == want.name
+            assert have.kind in NAMED
+        if want.default is not ANY:
+            assert have.default == want.default
+        kept.add(have.name)
+    more = [p for p in in_place if p.name not in kept and p.kind not in VARIADIC]
+    assert [p.name for p in more if p.default is inspect.Parameter.empty] == []
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_what_a_module_calls_public_is_there_once(name: str) -> None:
+    names = getattr(module(name), "__all__", [])
+    assert isinstance(names, list)  # in the order that ruff checks
+    assert len(set(names)) == len(names)
+    assert [n for n in names if not hasattr(module(name), n)] == []
+
+
+def test_fem_says_what_is_public() -> None:
+    of_fem = {name.split(".")[1] for name in SIGNATURES if name.startswith("fem.")}
+    assert of_fem - {"petsc", "scipy"} <= set(module("fem").__all__)
+
+
+def test_attributes_of_a_mesh() -> None:
+    msh = module("generators").rectangle((2, 2))
+    assert (msh.num_vertices, msh.num_faces, msh.euler_characteristic) == (9, 4, 1)
+    assert msh.extraordinary_vertices == {}
+    assert msh.comm is None
+    assert msh.ufl_domain() is msh.ufl_domain()
+
+
+def test_attributes_of_a_space_and_a_function() -> None:
+    fem = module("fem")
+    msh = module("generators").rectangle((2, 2))
+    V = fem.functionspace(msh, ("THCCS", 3), boundary="crease")
+    assert (V.num_dofs, V.num_cells, V.num_levels) == (9, 4, 1)
+    assert V.ufl_domain() is msh.ufl_domain()
+    assert V.hierarchy is not None
+    clamped = fem.functionspace(msh, ("THCCS", 3), boundary="clamped")
+    # Spaces of one mesh share UFL's domain and element: only their own comparison tells them apart.
+    assert V == V
+    assert hash(V) == hash(V)
+    assert V != clamped
+    uh = fem.Function(V, name="u")
+    assert uh.x.array.shape == (9,)
+    assert uh.x.array.dtype == np.float64
+    assert fem.functionspace(msh, ("THCCS", 3, (3,))).num_dofs % 3 == 0

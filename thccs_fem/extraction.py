@@ -1,0 +1,418 @@
+"""From a hierarchy to what is integrated: cells, their bicubic pieces, and an extraction operator for each piece.
+
+A *cell* is an active element of the hierarchy.  A *piece* is one bicubic patch of it: a regular cell is one piece, an
+irregular one is cut into three pieces a level and a cap.  On a piece, with u the dofs of its cell,
+
+    local B-spline coefficients = operator @ u[dofs].
+
+Cells are numbered level by level, within a level in the order of its faces.  The local basis is that of
+`thccs_fem.element`: function i + 4 j, i along the piece's first edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem import element
+from thccs_fem.bezier import bezier_masks, spline_grid
+from thccs_fem.hierarchy import Hierarchy, Stage
+from thccs_fem.subdivision import CHILD_AXES, CHILD_ORIGIN, Bools, Ints, child_at
+
+__all__ = ["Batch", "Cells", "evaluate_pieces", "extract"]
+
+WIDTH = 8  # operators are padded to a multiple of this many columns
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Cells whose operators have the same width, in the order of their numbers.
+
+    Attributes:
+        cells: Cell numbers, shape (n,).
+        dofs: Dofs of each cell, ascending, padded with -1 at the end, shape (n, width); where `operators` is None, in
+            local order and not padded.
+        offsets: Pieces of the k-th cell are offsets[k] .. offsets[k + 1] of this batch, shape (n + 1,).
+        nodes: Rows of `Cells.points` for each piece, shape (num_pieces, 16).
+        operators: Extraction operators, shape (num_pieces, 16, width); None: identity, one piece a cell.
+    """
+
+    cells: Ints
+    dofs: Ints
+    offsets: Ints
+    nodes: Ints
+    operators: Floats | None
+
+    def __post_init__(self) -> None:
+        for value in self.__dict__.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @property
+    def num_pieces(self) -> int:
+        """Number of pieces."""
+        return self.nodes.shape[0]
+
+    @cached_property
+    def piece_cells(self) -> Ints:
+        """Cell number of each piece, shape (num_pieces,)."""
+        return np.repeat(self.cells, np.diff(self.offsets))
+
+    def local(self, u: Floats) -> Floats:
+        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, k), for u of shape (num_dofs, k)."""
+        if self.operators is None:
+            return u[self.dofs]
+        values = np.where((self.dofs >= 0)[..., None], u[self.dofs], 0.0)
+        return np.matmul(self.operators, np.repeat(values, np.diff(self.offsets), axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells of a hierarchy; pieces are numbered batch by batch.
+
+    Attributes:
+        hierarchy: The hierarchy.
+        level: Level of each cell, shape (num_cells,).
+        level_face: Face of the level's `Level`, shape (num_cells,).
+        face: Face of the control mesh, shape (num_cells,).
+        points: Control points in the local B-spline basis, shape (num_nodes, gdim).
+        batches: The cells by width of their operators; the identity batch first.
+        piece_origin: Where the piece's (0, 0) lies in its cell, shape (num_pieces, 2).
+        piece_axes: Its edges u and v there, in columns, shape (num_pieces, 2, 2).
+        piece_of_face: For each level, the piece that a face of the level is, or -1.
+    """
+
+    hierarchy: Hierarchy
+    level: Ints
+    level_face: Ints
+    face: Ints
+    points: Floats
+    batches: tuple[Batch, ...]
+    piece_origin: Floats
+    piece_axes: Floats
+    piece_of_face: tuple[Ints, ...]
+
+    @property
+    def num_cells(self) -> int:
+        """Number of active elements."""
+        return self.level.size
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of scalar functions."""
+        return self.hierarchy.num_dofs
+
+    @property
+    def num_pieces(self) -> int:
+        """Number of bicubic pieces."""
+        return self.piece_origin.shape[0]
+
+    @cached_property
+    def boundary_pieces(self) -> tuple[Ints, Ints, Ints]:
+        """Pieces on the boundary, the side there, and the half-edge of the control mesh it lies on, three (n,) arrays.
+
+        Side k runs from corner k of the piece to corner k + 1.
+        """
+        sides = []
+        for stage, piece_of_face in zip(self.hierarchy.stages, self.piece_of_face, strict=True):
+            level = stage.level
+            on = np.flatnonzero(level.rim & (piece_of_face[level.face] >= 0))
+            sides.append(np.stack([piece_of_face[level.face[on]], on % 4, level.boundary_edge[on]]))
+        piece, side, edge = np.concatenate(sides, axis=1).astype(np.int32)
+        return piece, side, edge
+
+    def rows(self, pieces: Ints) -> sp.csr_array:
+        """Return the extraction operators of given pieces as one matrix, shape (16 n, num_dofs)."""
+        first = np.cumsum([0, *(batch.num_pieces for batch in self.batches)])
+        row, column, value = [], [], []
+        for batch, start in zip(self.batches, first, strict=False):
+            mine = np.flatnonzero((pieces >= start) & (pieces < start + batch.num_pieces))
+            local = pieces[mine] - start
+            dofs = batch.dofs[np.searchsorted(batch.offsets, local, side="right") - 1]
+            if batch.operators is None:
+                operators = np.broadcast_to(np.eye(16), (mine.size, 16, 16))
+            else:
+                operators = batch.operators[local]
+            i, j, k = np.nonzero((dofs >= 0)[:, None, :] & (operators != 0.0))
+            row.append(16 * mine[i] + j)
+            column.append(dofs[i, k])
+            value.append(operators[i, j, k])
+        entries = (np.concatenate(value), (np.concatenate(row), np.concatenate(column)))
+        return sp.csr_array(entries, shape=(16 * pieces.size, self.num_dofs))
+
+    @property
+    def tag(self) -> Ints:
+        """Tag of each cell, that of its face of the control mesh, shape (num_cells,)."""
+        return self.hierarchy.mesh.face_tags[self.face]
+
+    @cached_property
+    def piece_cell(self) -> Ints:
+        """Cell of each piece, shape (num_pieces,)."""
+        return np.concatenate([batch.piece_cells for batch in self.batches])
+
+    @cached_property
+    def piece_points(self) -> Floats:
+        """Control points of each piece in the local B-spline basis, shape (num_pieces, 16, gdim)."""
+        return self.points[np.concatenate([batch.nodes for batch in self.batches])]
+
+    def area_element(self, pieces: Ints, uv: Floats) -> Floats:
+        """Return the root of det g, the area of the surface per area of the reference square.
+
+        Args:
+            pieces: Pieces, shape (n,).
+            uv: Points in the reference square, the same for all, shape (m, 2).
+
+        Returns:
+            Shape (n, m).
+        """
+        du, dv = (
+            np.einsum("qj,qi,njic->nqc", v, u, self.piece_points[pieces].reshape(pieces.size, 4, 4, -1))
+            for u, v in (
+                (element.bspline_slopes(uv[:, 0]), element.bspline_values(uv[:, 1])),
+                (element.bspline_values(uv[:, 0]), element.bspline_slopes(uv[:, 1])),
+            )
+        )
+        uu, uv_, vv = ((a * b).sum(axis=2) for a, b in ((du, du), (du, dv), (dv, dv)))
+        return np.sqrt(np.maximum(uu * vv - uv_**2, 0.0))
+
+    def local(self, u: Floats) -> Floats:
+        """Return the local B-spline coefficients of all pieces, shape (num_pieces, 16, k), for u of shape (num_dofs, k)."""
+        return np.concatenate([batch.local(u) for batch in self.batches])
+
+    def locate(
+        self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+    ) -> tuple[Ints, Floats]:
+        """Return the piece that holds each point and the point's coordinates there.
+
+        Args:
+            faces: Faces of the control mesh, shape (n,).
+            uv: Coordinates in the face, shape (n, 2); see `thccs_fem.limit.evaluate` for the convention.
+            corner: Sub-quad of a polygon, shape (n,).
+
+        Returns:
+            Pieces, shape (n,), and coordinates in [0, 1]^2, shape (n, 2).
+        """
+        hierarchy = self.hierarchy
+        face, uv = hierarchy.root_position(faces, uv, corner)
+        piece = np.full(face.size, -1, dtype=np.int32)
+        local = np.zeros_like(uv)
+        open_points = np.arange(face.size)
+        for stage, piece_of_face in zip(hierarchy.stages, self.piece_of_face, strict=True):
+            here = piece_of_face[face]
+            done = here >= 0
+            piece[open_points[done]], local[open_points[done]] = here[done], uv[done]
+            open_points, face, uv = open_points[~done], face[~done], uv[~done]
+            if stage.step is None or not open_points.size:
+                break
+            child, uv = child_at(uv)
+            face = stage.step.first_child[face] + child
+        return piece, local
+
+
+def evaluate_pieces(local: Floats, piece: Ints, uv: Floats) -> Floats:
+    """Evaluate bicubic pieces.
+
+    Args:
+        local: Local B-spline coefficients, shape (num_pieces, 16, k).
+        piece: Piece of each point, shape (n,).
+        uv: Coordinates in it, shape (n, 2).
+
+    Returns:
+        Values, shape (n, k).
+    """
+    along_u, along_v = element.bspline_values(uv[:, 0]), element.bspline_values(uv[:, 1])
+    basis = (along_v[:, :, None] * along_u[:, None, :]).reshape(-1, 16)
+    return np.einsum("ni,nik->nk", basis, local[piece])
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Pieces of one level, before they are sorted into batches."""
+
+    cell: Ints
+    face: Ints
+    nodes: Ints  # into the points of this level
+    points: Floats
+    rows: sp.csr_array  # 16 rows a piece: local B-spline coefficients in terms of the dofs
+    regular: Bools
+    origin: Floats
+    axes: Floats
+
+
+def extract(hierarchy: Hierarchy) -> Cells:
+    """Return the cells of a hierarchy with the extraction operators of their pieces."""
+    level, level_face, face = _active_elements(hierarchy)
+    pieces = _all_pieces(hierarchy)
+    piece_level = np.repeat(np.arange(len(pieces)), [p.cell.size for p in pieces])
+    first_node = np.cumsum([0, *(len(p.points) for p in pieces[:-1])])
+    nodes = np.concatenate([first + p.nodes for first, p in zip(first_node, pieces, strict=True)]).astype(np.int32)
+    cell = np.concatenate([p.cell for p in pieces])
+    rows = sp.csr_array(sp.vstack([p.rows for p in pieces], format="csr"))
+    batches, order = _batches(cell, nodes, rows)
+    place = np.zeros(order.size, dtype=np.int32)
+    place[order] = np.arange(order.size, dtype=np.int32)
+    return Cells(
+        hierarchy=hierarchy,
+        level=level,
+        level_face=level_face,
+        face=face,
+        points=np.concatenate([p.points for p in pieces]),
+        batches=batches,
+        piece_origin=np.concatenate([p.origin for p in pieces])[order],
+        piece_axes=np.concatenate([p.axes for p in pieces])[order],
+        piece_of_face=tuple(
+            _scattered(stage.level.num_faces, p.face, place[piece_level == m])
+            for m, (stage, p) in enumerate(zip(hierarchy.stages, pieces, strict=True))
+        ),
+    )
+
+
+def _scattered(size: int, index: Ints, values: Ints) -> Ints:
+    """Return an array of -1 with the values put at the given places."""
+    array = np.full(size, -1, dtype=np.int32)
+    array[index] = values
+    return array
+
+
+def _active_elements(hierarchy: Hierarchy) -> tuple[Ints, Ints, Ints]:
+    """Return level, face of the level and face of the control mesh of every cell."""
+    faces = [stage.active_faces for stage in hierarchy.stages[: hierarchy.num_levels]]
+    level = np.repeat(np.arange(len(faces), dtype=np.int32), [f.size for f in faces])
+    root = [
+        hierarchy.stages[l].level.keys[f] >> (2 * l)  # each level adds two binary digits to the key
+        for l, f in enumerate(faces)
+    ]
+    return level, np.concatenate(faces), hierarchy.face_of_root[np.concatenate(root)]
+
+
+def _all_pieces(hierarchy: Hierarchy) -> list[_Pieces]:
+    """Return the pieces of each stage: active faces that are not cut, and the ends of the cuts."""
+    pieces = []
+    first_cell = 0
+    cell = origin = axes = None
+    for l, stage in enumerate(hierarchy.stages):
+        faces = stage.active_faces
+        if cell is None or origin is None or axes is None:
+            cell, origin, axes = _untouched(stage.level.num_faces)
+        cell[faces] = first_cell + np.arange(faces.size)
+        origin[faces], axes[faces] = 0.0, np.eye(2)
+        first_cell += faces.size
+        at = np.flatnonzero((cell >= 0) & ~stage.cut).astype(np.int32)
+        pieces.append(_pieces(hierarchy, l, at, cell[at], origin[at], axes[at]))
+        if stage.step is not None:
+            cell, origin, axes = _carried_to_children(stage, cell, origin, axes)
+    return pieces
+
+
+def _untouched(num_faces: int) -> tuple[Ints, Floats, Floats]:
+    return np.full(num_faces, -1, dtype=np.int32), np.zeros((num_faces, 2)), np.zeros((num_faces, 2, 2))
+
+
+def _carried_to_children(stage: Stage, cell: Ints, origin: Floats, axes: Floats) -> tuple[Ints, Floats, Floats]:
+    """Return cell, origin and axes of the faces of the next level: those of the parent where it was cut, else none."""
+    assert stage.step is not None
+    carried = _untouched(stage.step.fine.num_faces)
+    parent = np.flatnonzero(stage.cut)
+    for k in range(4):
+        child = stage.step.first_child[parent] + k
+        carried[0][child] = cell[parent]
+        carried[1][child] = origin[parent] + axes[parent] @ CHILD_ORIGIN[k]
+        carried[2][child] = axes[parent] @ CHILD_AXES[k] / 2.0
+    return carried
+
+
+def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Floats, axes: Floats) -> _Pieces:
+    """Return the pieces that the given faces of stage l are.
+
+    Regular interior faces read their 4 x 4 control vertices; all others, caps included, go through the Bezier masks.
+    """
+    stage = hierarchy.stages[l]
+    level, points = stage.level, hierarchy.points[l]
+    coefficients = sp.csr_array(stage.to_points @ hierarchy.coefficients[l])
+    plain = level.regular & ~level.boundary
+    regular = plain[level.quads[faces]].all(axis=1)
+    grid = spline_grid(level, faces[regular])
+    masks = bezier_masks(stage.boundary, faces[~regular])
+    num_masked = np.count_nonzero(~regular)
+    to_spline = sp.kron(sp.eye_array(num_masked, format="csr"), sp.csr_array(element.TO_BSPLINE), format="csr")
+    masked = sp.csr_array(to_spline @ sp.csr_array(masks @ coefficients))
+    nodes = np.zeros((faces.size, 16), dtype=np.int32)
+    nodes[regular] = grid
+    nodes[~regular] = level.num_vertices + np.arange(16 * num_masked).reshape(-1, 16)
+    stacked = sp.vstack([coefficients[grid.ravel()], masked], format="csr")
+    order = np.argsort(np.concatenate([np.flatnonzero(regular), np.flatnonzero(~regular)]), kind="stable")
+    return _Pieces(
+        cell=cell,
+        face=faces,
+        nodes=nodes,
+        points=np.concatenate([points, to_spline @ (masks[:, : level.num_vertices] @ points)]),
+        rows=sp.csr_array(stacked[(16 * order[:, None] + np.arange(16)).ravel()]),
+        regular=regular,
+        origin=origin,
+        axes=axes,
+    )
+
+
+def _batches(cell: Ints, nodes: Ints, rows: sp.csr_array) -> tuple[tuple[Batch, ...], Ints]:
+    """Sort pieces into batches; return them and the order in which the pieces stand in them."""
+    identity = _is_identity(rows)
+    same = np.flatnonzero(identity)
+    same = same[np.argsort(cell[same], kind="stable")]
+    batches = []
+    if same.size:
+        dofs = rows.indices[rows.indptr[16 * same][:, None] + np.arange(16)].astype(np.int32)
+        batches.append(Batch(cell[same], dofs, np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
+    others = np.flatnonzero(~identity)
+    others = others[np.argsort(cell[others], kind="stable")]
+    general, order = _general_batches(cell[others], nodes[others], rows, others)
+    return (*batches, *general), np.concatenate([same, *order]).astype(np.int32)
+
+
+def _is_identity(rows: sp.csr_array) -> Bools:
+    """Return the pieces whose 16 coefficients are 16 different dofs."""
+    single = (np.diff(rows.indptr).reshape(-1, 16) == 1).all(axis=1)
+    candidates = np.flatnonzero(single)
+    first = rows.indptr[16 * candidates][:, None] + np.arange(16)
+    dofs = np.sort(rows.indices[first], axis=1)
+    single[candidates] = (rows.data[first] == 1.0).all(axis=1) & (np.diff(dofs, axis=1) > 0).all(axis=1)
+    return single
+
+
+def _general_batches(cell: Ints, nodes: Ints, rows: sp.csr_array, pieces: Ints) -> tuple[list[Batch], list[Ints]]:
+    """Return batches of dense operators for the given pieces, which are sorted by cell, and their pieces."""
+    if not pieces.size:
+        return [], []
+    cells, first, count = np.unique(cell, return_index=True, return_counts=True)
+    number = np.repeat(np.arange(cells.size), count)
+    entries = sp.csr_array(rows[(16 * pieces[:, None] + np.arange(16)).ravel()])
+    row = np.repeat(np.arange(entries.shape[0]), np.diff(entries.indptr))
+    pair = number[row // 16].astype(np.int64) * rows.shape[1] + entries.indices
+    dofs_of_cells, column = np.unique(pair, return_inverse=True)
+    owner = dofs_of_cells // rows.shape[1]
+    size = np.bincount(owner, minlength=cells.size)
+    start = np.cumsum(size) - size
+    width = -(-size // WIDTH) * WIDTH
+    batches, order = [], []
+    for w in np.unique(width):
+        chosen = np.flatnonzero(width == w)
+        place = np.full(cells.size, -1)
+        place[chosen] = np.arange(chosen.size)
+        offsets = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
+        of_batch = np.repeat(first[chosen] - offsets[:-1], count[chosen]) + np.arange(offsets[-1])
+        dofs = np.full((chosen.size, w), -1, dtype=np.int32)
+        mine = place[owner] >= 0
+        dofs[place[owner[mine]], (np.arange(owner.size) - start[owner])[mine]] = (dofs_of_cells % rows.shape[1])[mine]
+        operators = np.zeros((of_batch.size, 16, w))
+        piece_place = np.full(pieces.size, -1)
+        piece_place[of_batch] = np.arange(of_batch.size)
+        e = np.flatnonzero(piece_place[row // 16] >= 0)
+        operators[piece_place[row[e] // 16], row[e] % 16, column[e] - start[number[row[e] // 16]]] = entries.data[e]
+        batches.append(Batch(cells[chosen], dofs, offsets, nodes[of_batch], operators))
+        order.append(pieces[of_batch])
+    return batches, order

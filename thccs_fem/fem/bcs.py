@@ -1,0 +1,282 @@
+"""Strong Dirichlet conditions: which degrees of freedom, and which values.
+
+Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of a
+function, or one through `V.sub(c)`.  No spline interpolates: an expression is projected, in L2 of the boundary edges that the
+named functions alone determine, or of the cells where the functions do not live on the boundary.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+import ufl
+from thccs_fem import element
+from thccs_fem.extraction import Cells
+from thccs_fem.fem.expression import ValueOrExpression, values_at
+from thccs_fem.fem.function import Constant
+from thccs_fem.fem.space import Component, FunctionSpace
+from thccs_fem.subdivision import Bools, Ints
+
+__all__ = ["DirichletBC", "boundary_dofs", "dirichletbc", "locate_dofs_geometrical", "region_dofs"]
+
+NONZERO = 1e-10  # extraction entries are 0 up to rounding or a good part of 1 in some piece of the cell
+NUM_GAUSS = 8  # points in each direction: exact for the mass matrix on straight pieces, far below the error of the space
+SIDES = np.array([[0, 1, 2, 3], [3, 7, 11, 15], [15, 14, 13, 12], [12, 8, 4, 0]])  # coefficients i + 4 j on each side
+
+Floats = npt.NDArray[np.float64]
+Marker = Callable[[Floats], npt.NDArray[np.bool_]]
+
+
+@dataclass(frozen=True, eq=False)
+class DirichletBC:
+    """Values of degrees of freedom.
+
+    Attributes:
+        function_space: The space.
+        dofs: Degrees of freedom, ascending, shape (n,), local.
+        values: Their values, shape (n,).
+    """
+
+    function_space: FunctionSpace
+    dofs: Ints
+    values: Floats
+
+
+def locate_dofs_geometrical(V: FunctionSpace, marker: Marker) -> Ints:
+    """Return the functions whose reference point is marked.
+
+    Args:
+        V: The space.
+        marker: Takes points x of shape (3, n) (the last row is zero in the plane), returns booleans of shape (n,).
+
+    Returns:
+        Function numbers, ascending, shape (m,), local.
+    """
+    return np.flatnonzero(_marked(marker, V.reference_points)).astype(np.int32)
+
+
+def boundary_dofs(V: FunctionSpace, marker: Marker | None = None, *, tag: int | None = None) -> Ints:
+    """Return the functions that do not vanish on the boundary or on a part of it.
+
+    Args:
+        V: The space.
+        marker: Takes points x of shape (3, n), returns booleans; an edge counts where its two ends and its middle are
+            marked.
+        tag: Edge tag of the control mesh; only its boundary edges.
+
+    Returns:
+        Function numbers, ascending, shape (m,), local.
+
+    Raises:
+        ValueError: If both a marker and a tag are given.
+    """
+    if marker is not None and tag is not None:
+        raise ValueError("give a marker or a tag, not both")
+    cells = V.cells
+    piece, side, edge = cells.boundary_pieces
+    chosen = np.ones(piece.size, dtype=bool)
+    if tag is not None:
+        chosen = _tagged_half_edges(V, tag)[edge]
+    if marker is not None:
+        middle = np.stack([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5]])
+        corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        for position in (corners[side], middle[side], corners[(side + 1) % 4]):
+            chosen &= _marked(marker, _points_at(cells, piece, position))
+    return np.unique(_trace_rows(cells, piece[chosen], side[chosen]).indices).astype(np.int32)
+
+
+def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: int | None = None) -> Ints:
+    """Return the functions that do not vanish on a set of control-mesh faces, however far these are refined.
+
+    Args:
+        V: The space.
+        faces: Faces of the control mesh, shape (k,).
+        tag: Or their face tag.
+
+    Returns:
+        Function numbers, ascending, shape (m,), local.
+
+    Raises:
+        ValueError: If not just one of `faces` and `tag` is given, or a face is out of range.
+    """
+    if (faces is None) == (tag is None):
+        raise ValueError("give the faces of the region, or their tag")
+    marked = np.zeros(V.mesh.num_faces, dtype=bool)
+    if faces is None:
+        marked |= V.mesh.face_tags == tag
+    else:
+        chosen = np.asarray(faces)
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= V.mesh.num_faces):
+            raise ValueError(f"faces run from 0 to {V.mesh.num_faces - 1}; got {chosen.min()} to {chosen.max()}")
+        marked[chosen] = True
+    cells = V.cells
+    dofs = [batch.dofs[marked[cells.face[batch.cells]]].ravel() for batch in cells.batches]
+    found = np.unique(np.concatenate(dofs))
+    return found[found >= 0].astype(np.int32)
+
+
+def dirichletbc(value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace | Component) -> DirichletBC:
+    """Prescribe a value on functions.
+
+    Args:
+        value: A number, an array of values per component (of all functions the same) or per function, a `Constant`, a UFL
+            expression, or a callable g(x) with x of shape (3, n). Expressions and callables are projected in L2.
+        dofs: Function numbers, shape (n,).
+        V: The space, or one component `V.sub(c)`.
+
+    Raises:
+        ValueError: If the dofs are out of range or the value's shape does not fit.
+    """
+    space, component = (V.space, V.component) if isinstance(V, Component) else (V, None)
+    functions = np.unique(np.asarray(dofs, dtype=np.int64))
+    if functions.size and (functions[0] < 0 or functions[-1] >= space.num_functions):
+        raise ValueError(f"dofs run from 0 to {space.num_functions - 1}; got {functions[0]} to {functions[-1]}")
+    components = np.arange(space.block_size) if component is None else np.array([component])
+    if isinstance(value, Constant):
+        value = value.value
+    if isinstance(value, ufl.core.expr.Expr) or callable(value):
+        values = _projected(space, functions, value, components.size)
+    else:
+        values = _broadcast(np.asarray(value, dtype=np.float64), np.asarray(dofs), functions, components.size)
+    numbers = space.block_size * functions[:, None] + components
+    return DirichletBC(space, numbers.ravel().astype(np.int32), values.ravel())
+
+
+def _broadcast(value: Floats, dofs: npt.NDArray[np.integer], functions: Ints, k: int) -> Floats:
+    """Return values of shape (functions, k) from one value, one a component, or one a function."""
+    if value.ndim == 0 or value.shape == (k,) and k > 1:
+        return np.broadcast_to(value, (functions.size, k))
+    if value.shape in ((dofs.size,), (dofs.size, k)):
+        _, first = np.unique(dofs, return_index=True)
+        return np.broadcast_to(value.reshape(dofs.size, -1), (dofs.size, k))[first]
+    raise ValueError(
+        f"a value of shape {value.shape} does not fit {dofs.size} dofs with {k} components: give a number, one value a "
+        f"component, one a dof, or shape ({dofs.size}, {k})"
+    )
+
+
+def _marked(marker: Marker, points: Floats) -> Bools:
+    """Return what the marker says of points of shape (n, gdim)."""
+    x = np.zeros((3, len(points)))
+    x[: points.shape[1]] = points.T
+    marks = np.asarray(marker(x))
+    if marks.shape != (len(points),):
+        raise ValueError(f"the marker returned shape {marks.shape} for {len(points)} points; it must return ({len(points)},)")
+    return marks.astype(bool)
+
+
+def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
+    """Return the half-edges of the control mesh whose edge carries the tag."""
+    mesh = V.mesh
+    edges = np.array([edge for edge, t in mesh.edge_tags.items() if t == tag], dtype=np.int64).reshape(-1, 2)
+    n = mesh.num_vertices
+    following = np.arange(1, mesh.face_vertices.size + 1)
+    following[mesh.face_offsets[1:] - 1] = mesh.face_offsets[:-1]
+    ends = np.sort(np.stack([mesh.face_vertices, mesh.face_vertices[following]], axis=1).astype(np.int64), axis=1)
+    return np.isin(ends[:, 0] * n + ends[:, 1], edges[:, 0] * n + edges[:, 1])
+
+
+def _points_at(cells: Cells, piece: Ints, uv: Floats) -> Floats:
+    basis = element.bspline_values(uv)
+    return np.einsum("nj,ni,njic->nc", basis[:, 1], basis[:, 0], cells.piece_points[piece].reshape(piece.size, 4, 4, -1))
+
+
+def _trace_rows(cells: Cells, piece: Ints, side: Ints) -> sp.csr_array:
+    """Return the Bernstein coefficients of the sides of pieces, shape (4 n, num_functions), without what is rounding."""
+    to_bernstein = sp.kron(sp.eye_array(piece.size, format="csr"), sp.csr_array(element.TO_BERNSTEIN), format="csr")
+    rows = (16 * np.arange(piece.size)[:, None] + SIDES[side]).ravel()
+    trace = sp.csr_array(sp.csr_array(to_bernstein[rows] @ cells.rows(piece)))
+    trace.data[np.abs(trace.data) < NONZERO] = 0.0
+    trace.eliminate_zeros()
+    return trace
+
+
+def _projected(V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int) -> Floats:
+    """Return the coefficients of the L2 projection of an expression on the functions, shape (functions, k)."""
+    basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
+    weighted = sp.csr_array(sp.diags_array(weights) @ basis)
+    mass = sp.csc_array(basis.T @ weighted)
+    return spla.splu(mass).solve(np.ascontiguousarray(weighted.T @ values)).reshape(functions.size, k)
+
+
+def _on_boundary(
+    V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int
+) -> tuple[sp.csr_array, Floats, Floats] | None:
+    """Return basis, weights and values at Gauss points of the boundary; None if a function has no trace there."""
+    cells = V.cells
+    piece, side, _ = cells.boundary_pieces
+    trace = _trace_rows(cells, piece, side)
+    chosen = _determined(trace, functions, 4)
+    if chosen is None:
+        return None
+    piece, side = piece[chosen], side[chosen]
+    t, w = _gauss()
+    start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    along = np.roll(start, -1, axis=0) - start
+    points = start[:, None] + along[:, None] * t[:, None]  # (4 sides, Gauss points, 2)
+    bernstein = sp.kron(sp.eye_array(piece.size), sp.csr_array(element.bernstein_values(t)), format="csr")
+    rows = sp.csr_array(trace[(4 * np.flatnonzero(chosen)[:, None] + np.arange(4)).ravel()])
+    control = (element.TO_BERNSTEIN @ cells.piece_points[piece])[np.arange(piece.size)[:, None], SIDES[side]]
+    tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(t), control)
+    weights = np.linalg.norm(tangent, axis=2) * w
+    values = values_at(value, V, piece, points.reshape(-1, 2), k).reshape(piece.size, 4, t.size, k)
+    values = values[np.arange(piece.size), side]
+    return sp.csr_array(bernstein @ rows[:, functions]), weights.ravel(), values.reshape(-1, k)
+
+
+def _on_cells(
+    V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int
+) -> tuple[sp.csr_array, Floats, Floats]:
+    """Return basis, weights and values at Gauss points of the cells that the functions determine."""
+    cells = V.cells
+    all_rows = cells.rows(np.arange(cells.num_pieces, dtype=np.int32))
+    chosen = _determined(all_rows, functions, 16)
+    if chosen is None:
+        raise ValueError(
+            "an expression cannot be projected on these dofs: some of them determine no boundary edge and no cell. Take "
+            "all functions of a part of the boundary (boundary_dofs) or of a region (region_dofs), or give the values as "
+            "an array"
+        )
+    piece = np.flatnonzero(chosen).astype(np.int32)
+    t, w = _gauss()
+    points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
+    basis = element.bspline_values(points)
+    table = (basis[:, 1, :, None] * basis[:, 0, None, :]).reshape(-1, 16)
+    rows = sp.csr_array(all_rows[(16 * piece[:, None] + np.arange(16)).ravel()])
+    at_points = sp.csr_array(sp.kron(sp.eye_array(piece.size), sp.csr_array(table), format="csr") @ rows[:, functions])
+    weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
+    return at_points, weights.ravel(), values_at(value, V, piece, points, k).reshape(-1, k)
+
+
+def _determined(rows: sp.csr_array, functions: Ints, height: int) -> Bools | None:
+    """Return the blocks of `height` rows in which only the given functions occur.
+
+    Functions that occur in no such block add every block they occur in. None if one occurs in none at all.
+    """
+    given = np.zeros(rows.shape[1], dtype=bool)
+    given[functions] = True
+    block = np.repeat(np.arange(rows.shape[0]) // height, np.diff(rows.indptr))
+    foreign = np.zeros(rows.shape[0] // height, dtype=bool)
+    foreign[block[~given[rows.indices]]] = True
+    present = np.zeros(rows.shape[1], dtype=bool)
+    present[rows.indices] = True
+    if not present[functions].all():
+        return None
+    covered = np.zeros(rows.shape[1], dtype=bool)
+    covered[rows.indices[~foreign[block]]] = True
+    lonely = given & ~covered
+    chosen = ~foreign
+    chosen[block[lonely[rows.indices]]] = True
+    return chosen
+
+
+def _gauss() -> tuple[Floats, Floats]:
+    """Return Gauss points and weights on [0, 1]."""
+    t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
+    return (t + 1.0) / 2.0, w / 2.0

@@ -1,0 +1,117 @@
+"""Functions in a THCCS space, and constants, as UFL objects with values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+import ufl
+from thccs_fem.extraction import evaluate_pieces
+from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.mesh import ControlMesh
+
+__all__ = ["Constant", "Function", "Vector"]
+
+
+class Vector:
+    """Coefficients of a function; `array` holds those this rank owns, then its ghosts (none in serial)."""
+
+    def __init__(self, size: int):
+        self._array = np.zeros(size)
+
+    @property
+    def array(self) -> npt.NDArray[np.float64]:
+        """Values, shape (num_dofs,), float64; write into it or assign to it."""
+        return self._array
+
+    @array.setter
+    def array(self, values: npt.ArrayLike) -> None:
+        self._array[:] = values
+
+
+class Function(ufl.Coefficient):
+    """A function of a THCCS space.
+
+    Args:
+        V: The space.
+        name: Name in output.
+    """
+
+    def __init__(self, V: FunctionSpace, name: str = "f"):
+        if not isinstance(V, FunctionSpace):
+            raise TypeError(f"a Function needs a space from fem.functionspace, got {type(V).__name__}")
+        super().__init__(V)
+        self.name = name
+        self._x = Vector(V.num_dofs)
+
+    @property
+    def function_space(self) -> FunctionSpace:
+        """The space."""
+        return self.ufl_function_space()
+
+    @property
+    def x(self) -> Vector:
+        """Coefficients."""
+        return self._x
+
+    def copy(self, name: str | None = None) -> Function:
+        """Return an independent function with the same values."""
+        other = Function(self.function_space, self.name if name is None else name)
+        other.x.array = self.x.array
+        return other
+
+    def local_coefficients(self) -> npt.NDArray[np.float64]:
+        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, block_size)."""
+        V = self.function_space
+        return V.cells.local(self.x.array.reshape(-1, V.block_size))
+
+    def eval(
+        self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+    ) -> npt.NDArray[np.float64]:
+        """Evaluate at points given on faces of the control mesh.
+
+        Args:
+            faces: Faces, shape (n,).
+            uv: Coordinates in [0, 1]^2, shape (n, 2), as for `limit.evaluate`.
+            corner: Sub-quad of a polygon, shape (n,).
+
+        Returns:
+            Values, shape (n,) for scalars and (n, k) for vectors.
+
+        Raises:
+            ValueError: If a face, coordinate or corner is out of range.
+        """
+        V = self.function_space
+        piece, position = V.cells.locate(faces, uv, corner)
+        values = evaluate_pieces(self.local_coefficients(), piece, position)
+        return values if V.value_shape else values[:, 0]
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class Constant(ufl.Constant):
+    """A constant, scalar or array, on a mesh; assign to `value` to change it between assemblies.
+
+    Args:
+        domain: The control mesh.
+        c: Value, float or array.
+    """
+
+    def __init__(self, domain: ControlMesh, c: npt.ArrayLike):
+        self._value = np.array(c, dtype=np.float64)
+        super().__init__(domain.ufl_domain(), self._value.shape)
+
+    @property
+    def value(self) -> Any:
+        """The value, float64 array of the constant's shape."""
+        return self._value
+
+    @value.setter
+    def value(self, c: npt.ArrayLike) -> None:
+        self._value[...] = c
+
+    def __float__(self) -> float:
+        return float(self._value)

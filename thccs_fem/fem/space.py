@@ -1,0 +1,209 @@
+"""Function spaces on the limit surface of a control mesh.
+
+A `FunctionSpace` is a UFL function space whose functions are the active functions of a `Hierarchy`, once for every component
+of the value.  Degree of freedom `block_size * i + c` is component c of function i.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+import ufl
+from thccs_fem import element
+from thccs_fem.bezier import bezier_masks
+from thccs_fem.boundary import BoundaryRule, to_dofs
+from thccs_fem.extraction import Cells, extract
+from thccs_fem.folds import check_no_folds
+from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
+from thccs_fem.mesh import ControlMesh
+from thccs_fem.subdivision import Ints
+
+__all__ = ["Component", "FunctionSpace", "functionspace"]
+
+FAMILY, DEGREE = "THCCS", 3
+
+
+class FunctionSpace(ufl.FunctionSpace):
+    """THCCS functions with values of a given shape; make one with `functionspace`, refine it with `adapt.refine`.
+
+    Args:
+        hierarchy: The hierarchy that holds the scalar functions.
+        value_shape: () for scalars, (k,) for vectors.
+    """
+
+    def __init__(self, hierarchy: Hierarchy, value_shape: tuple[int, ...] = ()):
+        super().__init__(hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline())
+        self.hierarchy = hierarchy
+        self.block_size = int(np.prod(value_shape, dtype=int))
+
+    @property
+    def mesh(self) -> ControlMesh:
+        """The control mesh."""
+        return self.hierarchy.mesh
+
+    @property
+    def num_functions(self) -> int:
+        """Number of scalar functions, global."""
+        return self.hierarchy.num_dofs
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of degrees of freedom, block_size for each scalar function, global."""
+        return self.block_size * self.num_functions
+
+    @property
+    def num_cells(self) -> int:
+        """Number of active elements, global."""
+        return self.cells.num_cells
+
+    @property
+    def num_levels(self) -> int:
+        """Number of levels; 1 when nothing is refined."""
+        return self.hierarchy.num_levels
+
+    @cached_property
+    def cells(self) -> Cells:
+        """Active elements with the extraction operators of their pieces."""
+        return _cells(self.hierarchy)
+
+    @cached_property
+    def reference_points(self) -> npt.NDArray[np.float64]:
+        """A point for each function, shape (num_functions, gdim).
+
+        The limit point of the function's vertex; on a clamped boundary a trace function sits at the rim vertex, the one
+        beside it a third of an edge inside.
+        """
+        hierarchy = self.hierarchy
+        points = []
+        for l in range(hierarchy.num_levels):
+            boundary = hierarchy.stages[l].boundary
+            limit = np.zeros((boundary.num_functions, self.mesh.gdim))
+            limit[: boundary.level.num_vertices] = _limit_points(hierarchy, l)
+            points.append((to_dofs(boundary) @ limit)[hierarchy.dof_functions(l)])
+        return np.concatenate(points)
+
+    def sub(self, component: int) -> Component:
+        """Return one component, for boundary conditions on it alone.
+
+        Raises:
+            IndexError: If there is no such component.
+        """
+        if not 0 <= component < self.block_size or not self.value_shape:
+            raise IndexError(f"component {component} of a space with value shape {self.value_shape}")
+        return Component(self, component)
+
+    def with_hierarchy(self, hierarchy: Hierarchy) -> FunctionSpace:
+        """Return the space of the same kind on another hierarchy of the same mesh."""
+        return FunctionSpace(hierarchy, self.value_shape)
+
+    def is_refinement_of(self, other: FunctionSpace) -> bool:
+        """Return whether every scalar function of `other` lies in this space."""
+        return self.hierarchy.is_refinement_of(other.hierarchy)
+
+    def prolongation(self, coarse: FunctionSpace) -> sp.csr_array:
+        """Return the exact transfer from a coarser space, shape (num_dofs, coarse.num_dofs).
+
+        Raises:
+            ValueError: If the spaces are not nested or their values have different shapes.
+        """
+        if self.value_shape != coarse.value_shape:
+            raise ValueError(f"values of shape {coarse.value_shape} cannot be carried to shape {self.value_shape}")
+        scalar = self.hierarchy.prolongation(coarse.hierarchy)
+        return sp.csr_array(sp.kron(scalar, sp.eye_array(self.block_size), format="csr"))
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        return (
+            isinstance(other, FunctionSpace)
+            and self.value_shape == other.value_shape
+            and (self.hierarchy is other.hierarchy or self.hierarchy.same_as(other.hierarchy))
+        )
+
+    def __hash__(self) -> int:
+        return hash((id(self.mesh), self.hierarchy.rule, self.num_dofs, self.value_shape))
+
+    def __repr__(self) -> str:
+        return (
+            f"FunctionSpace(THCCS degree 3, values {self.value_shape}, {self.hierarchy.rule} boundary, "
+            f"{self.num_levels} levels, {self.num_dofs} dofs)"
+        )
+
+
+class Component:
+    """One component of a vector-valued space; made by `FunctionSpace.sub`."""
+
+    def __init__(self, space: FunctionSpace, component: int):
+        self.space = space
+        self.component = component
+
+
+def functionspace(
+    mesh: ControlMesh,
+    element: tuple[Any, ...],
+    *,
+    boundary: BoundaryRule = "clamped",
+    cap_level: int = CAP_LEVEL,
+) -> FunctionSpace:
+    """Return the THCCS space on the limit surface of a control mesh.
+
+    Args:
+        mesh: The control mesh.
+        element: ("THCCS", 3) for scalars, ("THCCS", 3, (k,)) for vectors with k components.
+        boundary: "clamped" (full approximation order up to the boundary) or "crease" (the plain Catmull-Clark boundary).
+        cap_level: Level at which a bicubic cap ends the cut at extraordinary vertices; deeper where refinement goes
+            deeper.
+
+    Raises:
+        TypeError: If `mesh` is no control mesh.
+        ValueError: If the element is none of ours, or the planar surface folds.
+        NotImplementedError: If the mesh is distributed over several ranks or has creases inside.
+    """
+    if not isinstance(mesh, ControlMesh):
+        raise TypeError(f"functionspace needs a thccs_fem.mesh.ControlMesh, got {type(mesh).__name__}")
+    if boundary not in ("clamped", "crease"):
+        raise ValueError(f'boundary is {boundary!r}; it must be "clamped" or "crease"')
+    if mesh.comm is not None and mesh.comm.size > 1:
+        raise NotImplementedError(
+            f"the communicator has {mesh.comm.size} ranks, but spaces are serial so far: run on one rank, or give each "
+            f"rank its own mesh with comm=MPI.COMM_SELF"
+        )
+    value_shape = _value_shape(element)
+    hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level)
+    space = FunctionSpace(hierarchy, value_shape)
+    check_no_folds(space.cells)
+    return space
+
+
+def _value_shape(element: tuple[Any, ...]) -> tuple[int, ...]:
+    """Return the value shape that ("THCCS", 3[, shape]) asks for."""
+    if not isinstance(element, tuple) or not 2 <= len(element) <= 3 or element[:2] != (FAMILY, DEGREE):
+        raise ValueError(f'the element is {element!r}; it must be ("THCCS", 3), or ("THCCS", 3, (k,)) for k components')
+    shape = element[2] if len(element) == 3 else ()
+    if not isinstance(shape, tuple) or len(shape) > 1 or not all(isinstance(k, int) and k > 0 for k in shape):
+        raise ValueError(f"the value shape is {shape!r}; it must be () or (k,) with k components")
+    return shape
+
+
+def _limit_points(hierarchy: Hierarchy, l: int) -> npt.NDArray[np.float64]:
+    """Return the limit points of the vertices of Omega^l, shape (vertices of the level, gdim); others are zero."""
+    stage = hierarchy.stages[l]
+    faces: Ints = np.flatnonzero(stage.inside).astype(np.int32)
+    masks = bezier_masks(stage.boundary, faces)[:, : stage.level.num_vertices]
+    corners = (masks @ hierarchy.points[l]).reshape(faces.size, 16, -1)[:, [0, 3, 15, 12]]
+    points = np.zeros_like(hierarchy.points[l])
+    points[stage.level.quads[faces]] = corners
+    return points
+
+
+def _cells(hierarchy: Hierarchy) -> Cells:
+    """Return the cells of a hierarchy, made once and kept with it."""
+    cells = hierarchy.__dict__.get("_cells")
+    if cells is None:
+        cells = hierarchy.__dict__["_cells"] = extract(hierarchy)
+    return cells

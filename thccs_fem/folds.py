@@ -1,0 +1,88 @@
+"""Does a planar surface fold?  The sign of det J on its pieces, and far down at tagged corners.
+
+On a folded map |det J| hides the sign and the patch test fails by 1e-2 whatever the depth; a mesh that folds is refused
+by name.  With plain masks a corner with two or more faces folds where its angle exceeds 90 degrees a face, but only some
+levels below the control mesh, so the faces there are followed down to FOLD_LEVEL.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from thccs_fem import element
+from thccs_fem.bezier import bezier_masks
+from thccs_fem.boundary import Boundary
+from thccs_fem.extraction import Cells
+from thccs_fem.subdivision import Ints, Level, neighbourhood, subdivide
+
+__all__ = ["check_no_folds"]
+
+FOLD_LEVEL = 12
+SHOWN = 8  # faces named in a message
+
+Floats = npt.NDArray[np.float64]
+
+
+def check_no_folds(cells: Cells) -> None:
+    """Raise ValueError where a planar surface folds, naming faces of the control mesh; surfaces in space always pass."""
+    mesh = cells.hierarchy.mesh
+    if mesh.gdim != 2:
+        return
+    folded = np.unique(cells.face[cells.piece_cell[_folds(element.TO_BERNSTEIN @ cells.piece_points)]])
+    if folded.size:
+        raise ValueError(
+            f"the planar surface folds (det J <= 0) on {folded.size} of {mesh.num_faces} faces, first {folded[:SHOWN].tolist()}: "
+            f"move the vertices of these faces until neighbouring edges no longer cross, or subdivide them more evenly"
+        )
+    _check_tagged_corners(cells)
+
+
+def _folds(bernstein: Floats) -> npt.NDArray[np.bool_]:
+    """Return the patches with det J <= 0 at one of 5 x 5 points, shape (n,), for coefficients of shape (n, 16, 2).
+
+    The corners are left out: J vanishes at a degenerate corner and at a vertex of valence 3.
+    """
+    t = np.linspace(0.0, 1.0, 7)[1:-1]
+    values, slopes = element.bernstein_values(t), element.bernstein_slopes(t)
+    grid = bernstein.reshape(-1, 4, 4, 2)  # [patch, j, i, coordinate]
+    du = np.einsum("pjic,ai,bj->pabc", grid, slopes, values)
+    dv = np.einsum("pjic,ai,bj->pabc", grid, values, slopes)
+    det = du[..., 0] * dv[..., 1] - du[..., 1] * dv[..., 0]
+    return (det <= 0.0).any(axis=(1, 2))
+
+
+def _check_tagged_corners(cells: Cells) -> None:
+    """Follow the faces at corners of two or more faces down to FOLD_LEVEL."""
+    hierarchy = cells.hierarchy
+    level, points = hierarchy.root, hierarchy.points[0]
+    watched = level.corner & (level.vertex_num_faces > 1)
+    while watched.any() and level.number < FOLD_LEVEL:
+        step = subdivide(level, neighbourhood(level, level.touching(watched)))
+        points = step.matrix @ points
+        watched = _inherited(step.old, watched, step.fine)
+        level = step.fine
+        faces: Ints = np.flatnonzero(level.touching(watched)).astype(np.int32)
+        masks = bezier_masks(Boundary.of(level, "crease"), faces)
+        folded = faces[_folds((masks @ points).reshape(-1, 16, 2))]
+        if folded.size:
+            _refuse(cells, level, folded)
+
+
+def _inherited(old: Ints, watched: npt.NDArray[np.bool_], fine: Level) -> npt.NDArray[np.bool_]:
+    marks = np.zeros(fine.num_vertices, dtype=bool)
+    marks[: old.size] = watched[old]
+    return marks
+
+
+def _refuse(cells: Cells, level: Level, folded: Ints) -> None:
+    hierarchy = cells.hierarchy
+    faces = np.unique(hierarchy.face_of_root[level.keys[folded] >> (2 * level.number)])
+    control = level.control_vertex[level.quads[folded]]
+    corner = int(control[control >= 0][0])
+    raise ValueError(
+        f"the planar surface folds (det J <= 0) at level {level.number} at the tagged corner, vertex {corner} with "
+        f"{level.vertex_num_faces[level.control_vertex == corner][0]} faces, on faces {faces[:SHOWN].tolist()}: plain masks "
+        f"span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the spacing of the "
+        f"edges next to it, or remove its tag"
+    )

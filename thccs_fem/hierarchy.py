@@ -1,0 +1,377 @@
+"""Truncated hierarchy of Catmull-Clark levels (Wei, Zhang, Hughes, Scott 2015, sec. 4 and 5).
+
+Omega^{l+1}, a set of faces of level l inside Omega^l, is all that is stored; everything else follows from it:
+
+    selected^{l+1} = functions of level l + 1 whose support lies in Omega^{l+1}
+    passive^l      = functions of selected^l whose support lies in Omega^{l+1};   active^l = selected^l minus passive^l
+    C_0 = I,   C_{l+1} = Z_{l+1} S_l C_l + E_{l+1}
+
+C_l holds the coefficients of every active function in terms of the functions of level l.  Z zeroes the rows of
+selected^{l+1}: *this is the truncation*; E has a unit column for each newly active function.  One array, `selected`, is both
+what is activated and what is discarded, so the functions form a partition of unity whatever is refined.
+
+Dofs are numbered level by level, within a level vertices first, then traces, each in the order of the level.
+
+Faces with an irregular vertex that are not refined are cut by the same subdivision, down to one absolute level for each
+extraordinary vertex (`cap_levels`), where a bicubic cap ends the cut.  Cut faces ride along in the levels: functions outside
+of Omega^{l+1} keep their untruncated rows in C_{l+1}, so the same matrices give the pieces of cut faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem.boundary import (
+    Boundary,
+    BoundaryRule,
+    from_dofs,
+    subdivision_matrix,
+    support_of_traces,
+    to_dofs,
+    traces_meeting,
+)
+from thccs_fem.mesh import ControlMesh
+from thccs_fem.subdivision import Bools, Ints, Level, Step, control_level, in_quads, in_sub_quads, neighbourhood, subdivide
+
+__all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
+
+CAP_LEVEL = 4  # level at which the bicubic cap ends the cut at an irregular vertex, unless refinement goes deeper
+
+Keys = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One level of a hierarchy.
+
+    Attributes:
+        level: Faces held: those of Omega^l, of cut faces, and the ones around them.
+        boundary: Trace functions.
+        inside: Faces of Omega^l, shape (num_faces,).
+        refined: Faces of Omega^{l+1}, shape (num_faces,).
+        cut: Faces subdivided only because they are irregular, shape (num_faces,).
+        step: The subdivision of the faces with children; None at the end.
+        matrix: S_l in terms of the dof functions q, shape (functions of level l + 1, functions of level l); None at the
+            end.
+        selected: Functions of level l selected, shape (num_functions,).
+        active: Those not passive, shape (num_functions,).
+    """
+
+    level: Level
+    boundary: Boundary
+    inside: Bools
+    refined: Bools
+    cut: Bools
+    step: Step | None
+    matrix: sp.csr_array | None
+    selected: Bools
+    active: Bools
+
+    @cached_property
+    def to_points(self) -> sp.csr_array:
+        """T: from the dof functions q to (P, delta), shape (num_functions, num_functions)."""
+        return from_dofs(self.boundary)
+
+    @property
+    def active_faces(self) -> Ints:
+        """Active elements of this level: faces inside Omega^l and outside Omega^{l+1}."""
+        return np.flatnonzero(self.inside & ~self.refined).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Hierarchy:
+    """Truncated hierarchy on a control mesh; build it with `Hierarchy.on`, refine it with `refined`.
+
+    Attributes:
+        mesh: The control mesh.
+        rule: "clamped" or "crease".
+        cap_level: Least cap level.
+        refined_keys: Keys of the faces of Omega^{l+1} for each level l, ascending.
+        root: Level 0: the control mesh, or its first subdivision where `user_face_of_root` says so.
+        stages: One for each level, the coarsest first.
+    """
+
+    mesh: ControlMesh
+    rule: BoundaryRule
+    cap_level: int
+    refined_keys: tuple[Keys, ...]
+    root: Level
+    stages: tuple[Stage, ...]
+
+    @classmethod
+    def on(cls, mesh: ControlMesh, rule: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL) -> Self:
+        """Return the hierarchy of a mesh with nothing refined.
+
+        A mesh with polygons other than quads, or one whose level-0 functions are dependent, is subdivided once.
+        """
+        if cap_level < 1:
+            raise ValueError(f"cap_level is {cap_level}; a cap needs at least one cut: give 1 or more")
+        root = control_level(mesh)
+        if not root.is_quad or _is_dependent(root):
+            root = _as_level_zero(subdivide(root, np.ones(root.num_faces, dtype=bool)).fine)
+        return cls._build(mesh, rule, cap_level, (), root)
+
+    @classmethod
+    def _build(
+        cls, mesh: ControlMesh, rule: BoundaryRule, cap_level: int, refined_keys: Sequence[Keys], root: Level
+    ) -> Self:
+        keys = tuple(k for k in refined_keys if k.size)
+        caps = _cap_levels(root, keys, cap_level)
+        return cls(mesh, rule, cap_level, keys, root, tuple(_stages(root, rule, keys, caps)))
+
+    @property
+    def num_levels(self) -> int:
+        """Levels with active elements or functions: one more than the finest level that something was refined to."""
+        return len(self.refined_keys) + 1
+
+    @cached_property
+    def cap_levels(self) -> Ints:
+        """Cap level at each vertex of level 0 (only irregular ones have caps), shape (root.num_vertices,)."""
+        return _cap_levels(self.root, self.refined_keys, self.cap_level)
+
+    @cached_property
+    def face_of_root(self) -> Ints:
+        """Face of the control mesh that each face of level 0 is, or is a part of, shape (root.num_faces,)."""
+        faces = np.arange(self.mesh.num_faces, dtype=np.int32)
+        return np.repeat(faces, self.mesh.face_sizes) if self.root_is_subdivided else faces
+
+    @property
+    def root_is_subdivided(self) -> bool:
+        """Whether level 0 is the first subdivision of the control mesh; its face h is then the child at half-edge h."""
+        return self.root.num_faces != self.mesh.num_faces
+
+    def root_position(
+        self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+    ) -> tuple[Ints, npt.NDArray[np.float64]]:
+        """Return face of level 0 and coordinates there; arguments as for `subdivision.in_sub_quads`."""
+        return (in_sub_quads if self.root_is_subdivided else in_quads)(self.mesh, faces, uv, corner)
+
+    @cached_property
+    def points(self) -> tuple[npt.NDArray[np.float64], ...]:
+        """Control points of every stage, shape (vertices of the level, gdim)."""
+        points = [self.mesh.vertices]
+        if self.root_is_subdivided:
+            control = control_level(self.mesh)
+            points = [subdivide(control, np.ones(control.num_faces, dtype=bool)).matrix @ self.mesh.vertices]
+        for stage in self.stages:
+            if stage.step is not None:
+                points.append(stage.step.matrix @ points[-1])
+        return tuple(points)
+
+    @cached_property
+    def dof_offsets(self) -> Ints:
+        """First dof of each level and their number, shape (num_levels + 1,)."""
+        counts = [np.count_nonzero(stage.active) for stage in self.stages[: self.num_levels]]
+        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of active functions."""
+        return int(self.dof_offsets[-1])
+
+    def dof_functions(self, level: int) -> Ints:
+        """Return the functions of a level that are dofs, in dof order."""
+        return np.flatnonzero(self.stages[level].active).astype(np.int32)
+
+    @cached_property
+    def coefficients(self) -> tuple[sp.csr_array, ...]:
+        """C_l for every stage, shape (functions of the level, num_dofs)."""
+        return tuple(_coefficients(self.stages, self.stages))
+
+    def support(self, dofs: npt.NDArray[np.integer]) -> tuple[Bools, ...]:
+        """Return, for each level, the faces in the support of those given dofs that belong to the level."""
+        marked = np.zeros(self.num_dofs, dtype=bool)
+        marked[dofs] = True
+        supports = []
+        for l, stage in enumerate(self.stages[: self.num_levels]):
+            functions = stage.active.copy()
+            functions[stage.active] = marked[self.dof_offsets[l] : self.dof_offsets[l + 1]]
+            supports.append(_support(stage.boundary, functions))
+        return tuple(supports)
+
+    def refined(self, dofs: npt.NDArray[np.integer]) -> Self:
+        """Return the hierarchy in which the supports of the given dofs are refined once more (sec. 4.1).
+
+        Args:
+            dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
+        """
+        keys: list[Keys] = [*self.refined_keys, np.zeros(0, dtype=np.int64)]
+        for l, support in enumerate(self.support(dofs)):
+            keys[l] = np.union1d(keys[l], self.stages[l].level.keys[support])
+        _check_depth(self.root, len(keys))
+        return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
+
+    def truncated_to(self, num_levels: int) -> Self:
+        """Return the hierarchy with Omega^num_levels and everything finer emptied."""
+        return self._build(self.mesh, self.rule, self.cap_level, self.refined_keys[: num_levels - 1], self.root)
+
+    def is_refinement_of(self, other: Hierarchy) -> bool:
+        """Return whether every function of `other` is a function of this hierarchy."""
+        return (
+            self.mesh is other.mesh
+            and self.rule == other.rule
+            and len(other.refined_keys) <= len(self.refined_keys)
+            and all(np.isin(o, k).all() for k, o in zip(self.refined_keys, other.refined_keys, strict=False))
+        )
+
+    def prolongation(self, coarse: Hierarchy) -> sp.csr_array:
+        """Return the exact transfer from a coarser hierarchy, shape (num_dofs, coarse.num_dofs).
+
+        Truncation preserves coefficients: the row of dof (l, i) is row i of the coarse hierarchy's C_l.
+
+        Raises:
+            ValueError: If this hierarchy is no refinement of `coarse`.
+        """
+        if not self.is_refinement_of(coarse):
+            raise ValueError(
+                "the spaces are not nested: the target must be a refinement (by adapt.refine) of the source on the same "
+                "control mesh with the same boundary rule; use fem.project to carry a function between unrelated spaces"
+            )
+        carried = _coefficients(self.stages[: self.num_levels], coarse.stages)
+        rows = [c[self.dof_functions(l)] for l, c in enumerate(carried)]
+        return sp.csr_array(sp.vstack(rows, format="csr"))
+
+    def same_as(self, other: Hierarchy) -> bool:
+        """Return whether both describe the same functions."""
+        return self.num_levels == other.num_levels and self.is_refinement_of(other) and other.is_refinement_of(self)
+
+
+def _is_dependent(root: Level) -> bool:
+    """Return whether a closed mesh has only vertices of valence 3: S annihilates the alternating vector (Peters, Wu)."""
+    return bool((root.vertex_num_faces == 3).all() and not root.boundary.any())
+
+
+def _as_level_zero(level: Level) -> Level:
+    """Return a first subdivision as level 0 of a hierarchy."""
+    return replace(level, number=0, control_vertex=np.arange(level.num_vertices, dtype=np.int32))
+
+
+def _check_depth(root: Level, num_levels: int) -> None:
+    if (int(root.keys[-1]) + 1) * 4 ** (num_levels + 1) >= 2**62:
+        raise ValueError(f"{num_levels} levels on {root.num_faces} faces are more than 64-bit face keys can number")
+
+
+def _cap_levels(root: Level, refined_keys: Sequence[Keys], least: int) -> Ints:
+    """Return one absolute cap level for each vertex of level 0, finer than any element at it.
+
+    A face of level l >= 1 touches a vertex of level 0 if it is child 0 of child 0 ... of the child at that vertex.
+    """
+    caps = np.full(root.num_vertices, least, dtype=np.int32)
+    for l, keys in enumerate(refined_keys):
+        if l == 0:
+            at = root.vertices[root.half_edges(np.searchsorted(root.keys, keys))]
+        else:
+            at = root.vertices[keys[keys % 4 ** (l - 1) == 0] // 4 ** (l - 1)]
+        caps[at] = np.maximum(caps[at], l + 2)  # its children are elements of level l + 1
+    return caps
+
+
+def _stages(root: Level, rule: BoundaryRule, refined_keys: Sequence[Keys], caps: Ints) -> list[Stage]:
+    """Return the stages from level 0 to that of the deepest piece."""
+    stages: list[Stage] = []
+    level, boundary = root, Boundary.of(root, rule)
+    inside = np.ones(root.num_faces, dtype=bool)
+    held = inside  # faces of Omega^l and children of cut faces
+    while True:
+        keys = refined_keys[level.number] if level.number < len(refined_keys) else np.zeros(0, dtype=np.int64)
+        refined = np.isin(level.keys, keys, assume_unique=True) & inside
+        cut = held & ~refined & _needs_cut(level, caps)
+        selected = ~_meeting(boundary, ~inside)
+        active = selected & _meeting(boundary, ~refined)
+        opened = refined | cut
+        if not opened.any():
+            stages.append(Stage(level, boundary, inside, refined, cut, None, None, selected, active))
+            return stages
+        step = subdivide(level, neighbourhood(level, opened))
+        fine = Boundary.of(step.fine, rule)
+        matrix = _dof_step(boundary, fine, step)
+        stages.append(Stage(level, boundary, inside, refined, cut, step, matrix, selected, active))
+        inside, held = _children(step, refined), _children(step, opened)
+        level, boundary = step.fine, fine
+
+
+def _needs_cut(level: Level, caps: Ints) -> Bools:
+    """Return the faces with an irregular corner whose cap level is not reached yet."""
+    ends_later = ~level.regular
+    ends_later &= np.where(level.control_vertex >= 0, caps[level.control_vertex], 0) > level.number
+    return level.touching(ends_later)
+
+
+def _children(step: Step, faces: Bools) -> Bools:
+    """Return the children of the marked quads, as marks on the fine level."""
+    marks = np.zeros(step.fine.num_faces, dtype=bool)
+    marks[(step.first_child[faces][:, None] + np.arange(4)).ravel()] = True
+    return marks
+
+
+def _dof_step(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_array:
+    """Return T_{l+1}^-1 S_l T_l."""
+    if not coarse.vertex.size and not fine.vertex.size:
+        return step.matrix
+    return sp.csr_array(to_dofs(fine) @ subdivision_matrix(coarse, fine, step) @ from_dofs(coarse))
+
+
+def _meeting(boundary: Boundary, faces: Bools) -> Bools:
+    """Return the functions whose support meets the marked faces, shape (num_functions,).
+
+    The support of a vertex's function are the faces that touch a face of the vertex; that of a trace is smaller.
+    """
+    level = boundary.level
+    vertices = level.corners_of(neighbourhood(level, faces))
+    return np.concatenate([vertices, traces_meeting(boundary, faces)])
+
+
+def _support(boundary: Boundary, functions: Bools) -> Bools:
+    """Return the faces in the union of the supports of the marked functions, shape (num_faces,)."""
+    level = boundary.level
+    vertices, traces = np.split(functions, [level.num_vertices])
+    return neighbourhood(level, level.touching(vertices)) | support_of_traces(boundary, traces)
+
+
+def _coefficients(stages: Sequence[Stage], of: Sequence[Stage]) -> list[sp.csr_array]:
+    """Return, on each of the given stages, the coefficients of the dofs of the hierarchy `of`.
+
+    `of` is the stages' own hierarchy, or a coarser one: then its functions are found on the larger levels by face keys.
+    """
+    num_dofs = sum(int(np.count_nonzero(stage.active)) for stage in of)
+    result: list[sp.csr_array] = []
+    first = 0
+    for l, stage in enumerate(stages):
+        size = stage.boundary.num_functions
+        selected, active = (_functions_on(stage, of[l]) if l < len(of) else (np.zeros(0, dtype=np.int32),) * 2)
+        columns = first + np.arange(active.size)
+        first += active.size
+        unit = sp.csr_array((np.ones(active.size), (active, columns)), shape=(size, num_dofs))
+        if l == 0:
+            result.append(unit)
+            continue
+        matrix = stages[l - 1].matrix
+        assert matrix is not None  # every stage but the last has a step
+        kept = np.ones(size)
+        kept[selected] = 0.0  # the truncation
+        result.append(sp.csr_array(sp.diags_array(kept, format="csr") @ (matrix @ result[-1]) + unit))
+        result[-1].eliminate_zeros()
+    return result
+
+
+def _functions_on(stage: Stage, other: Stage) -> tuple[Ints, Ints]:
+    """Return the selected and the active functions of `other` as functions of `stage`, the same level held further."""
+    if stage is other:
+        return np.flatnonzero(stage.selected).astype(np.int32), np.flatnonzero(stage.active).astype(np.int32)
+    level, part = stage.level, other.level
+    found = np.minimum(np.searchsorted(level.keys, part.keys), level.num_faces - 1)
+    same = level.keys[found] == part.keys
+    number = np.full(other.boundary.num_functions, -1, dtype=np.int32)
+    vertices = number[: part.num_vertices]
+    vertices[part.quads[same]] = level.quads[found[same]]
+    trace = other.boundary.vertex
+    shift = part.num_vertices + np.arange(trace.size) - other.boundary.first[trace]
+    number[part.num_vertices :] = stage.boundary.first[vertices[trace]] + shift
+    return number[other.selected], number[other.active]

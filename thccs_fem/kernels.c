@@ -1,0 +1,379 @@
+/* All loops of the project that numpy can't do over all cells at once. Compiled by jit.library(). */
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "kernels.h"
+
+enum { LOCAL = 16 }; /* functions on a piece */
+
+/* ---- Assembly -------------------------------------------------------------------------------------------------- */
+
+/* Space for one cell at a time, in one allocation. */
+typedef struct {
+  double points[3 * LOCAL]; /* the third coordinate stays 0 in the plane */
+  double *cell_coefficients;  /* (width, block size) of each coefficient in turn */
+  double *piece_coefficients; /* (16, block size) of each coefficient in turn */
+  double *piece_tensor;
+  double *cell_tensor;
+  double *half;  /* (16, width): A^T C */
+  double *block; /* (16, 16): one pair of components of piece_tensor */
+} workspace;
+
+/* Return the allocation, to be freed, or NULL. */
+static void *make_workspace(workspace *work, const thccs_batch *batch, const thccs_integral *integral,
+                            int64_t components)
+{
+  int64_t block_sizes = 0;
+  for (int32_t i = 0; i < integral->num_coefficients; ++i)
+    block_sizes += integral->block_sizes[i];
+  const int64_t w = batch->width;
+  const int64_t sizes[] = {w * block_sizes, LOCAL * block_sizes, LOCAL * LOCAL * components, w * w * components,
+                           LOCAL * w, LOCAL * LOCAL};
+  int64_t total = 0;
+  for (int i = 0; i < 6; ++i)
+    total += sizes[i];
+  void *memory = calloc(total + 8, sizeof(double));
+  if (!memory)
+    return NULL;
+  double *next = (double *)(((uintptr_t)memory + 63) / 64 * 64);
+  memset(work->points, 0, sizeof work->points);
+  double **parts[] = {&work->cell_coefficients, &work->piece_coefficients, &work->piece_tensor,
+                      &work->cell_tensor,       &work->half,               &work->block};
+  for (int i = 0; i < 6; ++i) {
+    *parts[i] = next;
+    next += sizes[i];
+  }
+  return memory;
+}
+
+/* Values of the coefficients at the dofs of a cell. */
+static void gather_coefficients(const thccs_integral *integral, int32_t width, const int32_t *dofs, double *out)
+{
+  for (int32_t i = 0; i < integral->num_coefficients; ++i) {
+    const int32_t bs = integral->block_sizes[i];
+    const double *values = integral->coefficients[i];
+    if (values)
+      for (int32_t j = 0; j < width; ++j)
+        for (int32_t c = 0; c < bs; ++c)
+          out[j * bs + c] = dofs[j] < 0 ? 0.0 : values[(int64_t)bs * dofs[j] + c];
+    out += (int64_t)width * bs;
+  }
+}
+
+/* Their local B-spline coefficients on a piece: operator @ values. */
+static void extract_coefficients(const thccs_integral *integral, int32_t width, const double *operator,
+                                 const double *in, double *out)
+{
+  for (int32_t i = 0; i < integral->num_coefficients; ++i) {
+    const int32_t bs = integral->block_sizes[i];
+    if (integral->coefficients[i])
+      for (int32_t r = 0; r < LOCAL; ++r)
+        for (int32_t c = 0; c < bs; ++c) {
+          double sum = 0.0;
+          for (int32_t j = 0; j < width; ++j)
+            sum += operator[r * width + j] * in[j * bs + c];
+          out[r * bs + c] = sum;
+        }
+    in += (int64_t)width * bs;
+    out += LOCAL * (int64_t)bs;
+  }
+}
+
+/* work->piece_tensor = the integral over a piece. The coefficients of its cell have been gathered. */
+static void integrate_piece(const thccs_batch *batch, const thccs_integral *integral, int64_t piece, int64_t size,
+                            workspace *work)
+{
+  const int32_t *nodes = batch->nodes + LOCAL * piece;
+  for (int i = 0; i < LOCAL; ++i)
+    for (int c = 0; c < batch->gdim; ++c)
+      work->points[3 * i + c] = batch->points[(int64_t)batch->gdim * nodes[i] + c];
+  const double *coefficients = work->cell_coefficients;
+  if (batch->operators && integral->num_coefficients) {
+    extract_coefficients(integral, batch->width, batch->operators + LOCAL * batch->width * piece, coefficients,
+                         work->piece_coefficients);
+    coefficients = work->piece_coefficients;
+  }
+  memset(work->piece_tensor, 0, size * sizeof(double));
+  integral->kernel(work->piece_tensor, coefficients, integral->constants, work->points, NULL, NULL, NULL);
+}
+
+static int32_t chosen(const thccs_integral *integral, int32_t i)
+{
+  return integral->cells ? integral->cells[i] : i;
+}
+
+int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values)
+{
+  workspace work;
+  void *memory = make_workspace(&work, batch, integral, 1);
+  if (!memory)
+    return -1;
+  for (int32_t i = 0; i < integral->num_cells; ++i) {
+    const int32_t k = chosen(integral, i);
+    gather_coefficients(integral, batch->width, batch->dofs + (int64_t)batch->width * k, work.cell_coefficients);
+    for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
+      integrate_piece(batch, integral, piece, 1, &work);
+      values[batch->cells[k]] += work.piece_tensor[0];
+    }
+  }
+  free(memory);
+  return 0;
+}
+
+int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                          double *values)
+{
+  workspace work;
+  void *memory = make_workspace(&work, batch, integral, block_size);
+  if (!memory)
+    return -1;
+  const int32_t bs = block_size, width = batch->width;
+  for (int32_t i = 0; i < integral->num_cells; ++i) {
+    const int32_t k = chosen(integral, i);
+    const int32_t *dofs = batch->dofs + (int64_t)width * k;
+    gather_coefficients(integral, width, dofs, work.cell_coefficients);
+    const double *tensor = work.piece_tensor;
+    if (batch->operators) {
+      tensor = work.cell_tensor;
+      memset(work.cell_tensor, 0, width * bs * sizeof(double));
+    }
+    for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
+      integrate_piece(batch, integral, piece, LOCAL * bs, &work);
+      if (batch->operators) {
+        const double *operator = batch->operators + LOCAL * width * piece;
+        for (int32_t r = 0; r < LOCAL; ++r)
+          for (int32_t j = 0; j < width; ++j)
+            for (int32_t c = 0; c < bs; ++c)
+              work.cell_tensor[j * bs + c] += operator[r * width + j] * work.piece_tensor[r * bs + c];
+      }
+    }
+    for (int32_t j = 0; j < width && dofs[j] >= 0; ++j)
+      for (int32_t c = 0; c < bs; ++c)
+        values[(int64_t)bs * dofs[j] + c] += tensor[j * bs + c];
+  }
+  free(memory);
+  return 0;
+}
+
+/* As many doubles as one register holds: wider vectors are legal C but go through memory. */
+#if defined(__AVX512F__)
+enum { LANES = 8 };
+#elif defined(__AVX__)
+enum { LANES = 4 };
+#else
+enum { LANES = 2 };
+#endif
+typedef double vector __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+
+/* out (m, n) += x^T y with x (16, m) and y (16, n), m and n multiples of 8: eight registers of sums at a time. */
+static void add_product(int32_t m, int32_t n, const double *restrict x, const double *restrict y,
+                        double *restrict out)
+{
+  for (int32_t j = 0; j < n; j += LANES)
+    for (int32_t i = 0; i < m; i += 8) {
+      vector sum[8];
+      for (int a = 0; a < 8; ++a)
+        sum[a] = *(const vector *)(out + (i + a) * n + j);
+      for (int k = 0; k < LOCAL; ++k) {
+        const vector right = *(const vector *)(y + k * n + j);
+        for (int a = 0; a < 8; ++a)
+          sum[a] += x[k * m + i + a] * right;
+      }
+      for (int a = 0; a < 8; ++a)
+        *(vector *)(out + (i + a) * n + j) = sum[a];
+    }
+}
+
+/* work->cell_tensor (rows, columns, width, width) += C^T A C for each pair of components of the piece's A. */
+static void add_extracted(int32_t rows, int32_t columns, int32_t width, const double *operator, workspace *work)
+{
+  for (int32_t r = 0; r < rows; ++r)
+    for (int32_t c = 0; c < columns; ++c) {
+      const double *block = work->piece_tensor;
+      if (rows * columns > 1) {
+        for (int i = 0; i < LOCAL; ++i)
+          for (int j = 0; j < LOCAL; ++j)
+            work->block[LOCAL * i + j] =
+                work->piece_tensor[((int64_t)i * rows + r) * LOCAL * columns + j * columns + c];
+        block = work->block;
+      }
+      memset(work->half, 0, LOCAL * width * sizeof(double));
+      add_product(LOCAL, width, block, operator, work->half);
+      add_product(width, width, work->half, operator, work->cell_tensor + (int64_t)(r * columns + c) * width * width);
+    }
+}
+
+/* Entry (a, b) of the components (r, c) of a cell's tensor is number
+   r * row_component + c * column_component + a * row_stride + b * column_stride. */
+typedef struct {
+  int64_t row_component, column_component, row_stride, column_stride;
+} layout;
+
+/* Where the entries of a cell's tensor go: see thccs_assemble_matrix. */
+typedef struct {
+  const int32_t *indptr;
+  const void *positions;
+  int32_t position_size;
+} target;
+
+static inline __attribute__((always_inline)) void add_rows(int32_t n, const int32_t *dofs, int32_t rows,
+                                                           int32_t columns, layout at, target into,
+                                                           const double *restrict tensor,
+                                                           double *restrict values)
+{
+  const uint8_t *narrow = into.positions;
+  const uint16_t *wide = into.positions;
+  for (int32_t a = 0; a < n; ++a, narrow += n, wide += n) {
+    const int64_t begin = into.indptr[dofs[a]], length = into.indptr[dofs[a] + 1] - begin;
+    for (int32_t r = 0; r < rows; ++r)
+      for (int32_t c = 0; c < columns; ++c) {
+        const double *from = tensor + r * at.row_component + c * at.column_component + a * at.row_stride;
+        double *to = values + begin * rows * columns + r * length * columns + c;
+        for (int32_t b = 0; b < n; ++b)
+          to[columns * (into.position_size == 1 ? narrow[b] : wide[b])] += from[b * at.column_stride];
+      }
+  }
+}
+
+int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
+                          const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                          const void *positions, double *values)
+{
+  workspace work;
+  const int32_t width = batch->width, components = rows * columns;
+  void *memory = make_workspace(&work, batch, integral, components);
+  if (!memory)
+    return -1;
+  const double *tensor = batch->operators ? work.cell_tensor : work.piece_tensor;
+  const layout at = batch->operators
+                        ? (layout){(int64_t)columns * width * width, (int64_t)width * width, width, 1}
+                        : (layout){LOCAL * columns, 1, LOCAL * components, columns};
+  for (int32_t i = 0; i < integral->num_cells; ++i) {
+    const int32_t k = chosen(integral, i);
+    const int32_t *dofs = batch->dofs + (int64_t)width * k;
+    const target into = {indptr, (const char *)positions + starts[k] * position_size, position_size};
+    gather_coefficients(integral, width, dofs, work.cell_coefficients);
+    if (batch->operators)
+      memset(work.cell_tensor, 0, (int64_t)width * width * components * sizeof(double));
+    for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
+      integrate_piece(batch, integral, piece, LOCAL * LOCAL * components, &work);
+      if (batch->operators)
+        add_extracted(rows, columns, width, batch->operators + LOCAL * width * piece, &work);
+    }
+    int32_t n = 0;
+    while (n < width && dofs[n] >= 0)
+      ++n;
+    if (components == 1 && position_size == 1) /* the usual case, with what it is told to the compiler */
+      add_rows(n, dofs, 1, 1, (layout){0, 0, width, 1}, (target){indptr, into.positions, 1}, tensor, values);
+    else
+      add_rows(n, dofs, rows, columns, at, into, tensor, values);
+  }
+  free(memory);
+  return 0;
+}
+
+/* ---- Sparsity pattern ------------------------------------------------------------------------------------------ */
+
+void thccs_sparsity(int32_t num_dofs, const int32_t *cell_offsets, const int32_t *cell_dofs,
+                    const int32_t *dof_offsets, const int32_t *dof_cells, int32_t *restrict seen,
+                    int32_t *restrict next, int32_t *restrict indices)
+{
+  for (int32_t i = 0; i < num_dofs; ++i)
+    for (int32_t c = dof_offsets[i]; c < dof_offsets[i + 1]; ++c)
+      for (int32_t d = cell_offsets[dof_cells[c]]; d < cell_offsets[dof_cells[c] + 1]; ++d) {
+        const int32_t j = cell_dofs[d];
+        if (seen[j] == i)
+          continue;
+        seen[j] = i;
+        /* The pattern is symmetric: as i increases, row j gets its columns in order. */
+        if (indices)
+          indices[next[j]] = i;
+        ++next[j];
+      }
+}
+
+void thccs_positions(int32_t num_dofs, const int32_t *restrict cell_offsets, const int32_t *restrict cell_dofs,
+                     const int32_t *restrict dof_offsets, const int32_t *restrict dof_cells,
+                     const int32_t *restrict dof_locals, const int32_t *restrict indptr,
+                     const int32_t *restrict indices, int32_t *restrict place, const int64_t *restrict starts,
+                     int32_t position_size, void *restrict positions)
+{
+  uint8_t *narrow = positions;
+  uint16_t *wide = positions;
+  for (int32_t i = 0; i < num_dofs; ++i) {
+    const int32_t begin = indptr[i], length = indptr[i + 1] - begin;
+    for (int32_t p = 0; p < length; ++p)
+      place[indices[begin + p]] = p;
+    for (int32_t c = dof_offsets[i]; c < dof_offsets[i + 1]; ++c) {
+      const int32_t cell = dof_cells[c], first = cell_offsets[cell], n = cell_offsets[cell + 1] - first;
+      const int64_t start = starts[cell] + (int64_t)n * dof_locals[c];
+      for (int32_t b = 0; b < n; ++b)
+        if (position_size == 1)
+          narrow[start + b] = (uint8_t)place[cell_dofs[first + b]];
+        else
+          wide[start + b] = (uint16_t)place[cell_dofs[first + b]];
+    }
+  }
+}
+
+void thccs_tabulate(thccs_kernel *kernel, int32_t n, int32_t num_values, int32_t num_coefficients,
+                    const double *coefficients, const double *constants, const double *points, double *values) {
+  const int entity[2] = {0, 0};
+  const uint8_t permutation[2] = {0, 0};
+  for (int64_t k = 0; k < n; ++k)
+    kernel(values + k * num_values, coefficients + k * num_coefficients, constants, points + k * 48, entity,
+           permutation, NULL);
+}
+
+/* ---- Evaluation ------------------------------------------------------------------------------------------------ */
+
+/* The cubic Bernstein polynomials at t, their first and their second derivatives. */
+static void bernstein(double t, double b[3][4])
+{
+  const double s = 1.0 - t;
+  const double values[3][4] = {{s * s * s, 3.0 * s * s * t, 3.0 * s * t * t, t * t * t},
+                               {-3.0 * s * s, 3.0 * s * (s - 2.0 * t), 3.0 * t * (2.0 * s - t), 3.0 * t * t},
+                               {6.0 * s, 6.0 * (t - 2.0 * s), 6.0 * (s - 2.0 * t), 6.0 * t}};
+  memcpy(b, values, sizeof values);
+}
+
+/* Number of derivatives along u and along v of each row of the result. */
+static const int ORDERS[6][2] = {{0, 0}, {1, 0}, {0, 1}, {2, 0}, {1, 1}, {0, 2}};
+
+static inline __attribute__((always_inline)) void evaluate_patches(int64_t n, const int32_t *patches,
+                                                                   const double *uv, int32_t size,
+                                                                   const double *restrict coefficients,
+                                                                   int rows, double *restrict out)
+{
+  for (int64_t p = 0; p < n; ++p) {
+    const double *restrict c = coefficients + (int64_t)LOCAL * size * patches[p];
+    double u[3][4], v[3][4];
+    bernstein(uv[2 * p], u);
+    bernstein(uv[2 * p + 1], v);
+    for (int row = 0; row < rows; ++row) {
+      const double *along_u = u[ORDERS[row][0]], *along_v = v[ORDERS[row][1]];
+      double *to = out + (row * n + p) * size;
+      for (int32_t k = 0; k < size; ++k) {
+        double sum = 0.0;
+        for (int j = 0; j < 4; ++j)
+          for (int i = 0; i < 4; ++i)
+            sum += along_v[j] * (along_u[i] * c[(i + 4 * j) * size + k]);
+        to[k] = sum;
+      }
+    }
+  }
+}
+
+void thccs_evaluate_patches(int64_t n, const int32_t *patches, const double *uv, int32_t size,
+                            const double *coefficients, int32_t rows, double *out)
+{
+  /* The usual cases with their sizes known to the compiler. */
+  if (size == 3 && rows == 3)
+    evaluate_patches(n, patches, uv, 3, coefficients, 3, out);
+  else if (size == 3 && rows == 1)
+    evaluate_patches(n, patches, uv, 3, coefficients, 1, out);
+  else
+    evaluate_patches(n, patches, uv, size, coefficients, rows, out);
+}

@@ -1,0 +1,69 @@
+/* Declarations of kernels.c, for the C compiler and for cffi: plain C, no preprocessor. */
+
+/* Of FFCx: adds the integral over one piece to A. Arguments: A, coefficients, constants, control points (16, 3), and
+   three that only facets need. */
+typedef void thccs_kernel(double *, const double *, const double *, const double *, const int *, const uint8_t *,
+                          void *);
+
+/* Cells of equal width (extraction.Batch), and the control points. */
+typedef struct {
+  int32_t width;           /* of the rows of dofs and operators, a multiple of 8 */
+  int32_t gdim;
+  const int32_t *cells;    /* (n) cell numbers */
+  const int32_t *dofs;     /* (n, width) scalar dofs, -1 at the end of a row is padding */
+  const int32_t *offsets;  /* (n + 1) pieces of the k-th cell: offsets[k] .. offsets[k + 1] */
+  const int32_t *nodes;    /* (pieces, 16) rows of points */
+  const double *operators; /* (pieces, 16, width), or NULL: identity, width 16 and one piece a cell */
+  const double *points;    /* (nodes, gdim) */
+} thccs_batch;
+
+/* What is integrated, and on which cells of the batch. */
+typedef struct {
+  thccs_kernel *kernel;
+  const double *constants;
+  int32_t num_coefficients;
+  const int32_t *block_sizes;          /* (num_coefficients) */
+  const double *const *coefficients;   /* (num_coefficients) block_size values a dof; NULL: not used here */
+  int32_t num_cells;
+  const int32_t *cells;                /* (num_cells) positions in the batch, or NULL: 0 .. num_cells */
+} thccs_integral;
+
+/* These three return 0, or -1 when there is no memory. */
+
+/* values[cell] += integral over the cell. */
+int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values);
+
+/* values[block_size * dof + component] += integral. */
+int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                          double *values);
+
+/* The matrix of the scalar dofs has rows beginning at indptr. The values are those of the Kronecker product of that
+   pattern with dense blocks of rows x columns components. The k-th cell of the batch has n dofs; entry (a, b) of its
+   tensor belongs positions[starts[k] + n a + b] entries after the beginning of its row. position_size is 1 (uint8)
+   or 2 (uint16). */
+int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
+                          const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                          const void *positions, double *values);
+
+/* Which dofs share a cell. First with indices NULL and next 0: next[i] becomes the length of row i; then with
+   next[i] the beginning of row i: its columns are written, in order. seen (num_dofs) is -1 before each call. */
+void thccs_sparsity(int32_t num_dofs, const int32_t *cell_offsets, const int32_t *cell_dofs,
+                    const int32_t *dof_offsets, const int32_t *dof_cells, int32_t *seen, int32_t *next,
+                    int32_t *indices);
+
+/* The positions for thccs_assemble_matrix. dof_locals: which dof of its cell; place (num_dofs) is scratch. */
+void thccs_positions(int32_t num_dofs, const int32_t *cell_offsets, const int32_t *cell_dofs,
+                     const int32_t *dof_offsets, const int32_t *dof_cells, const int32_t *dof_locals,
+                     const int32_t *indptr, const int32_t *indices, int32_t *place, const int64_t *starts,
+                     int32_t position_size, void *positions);
+
+/* An FFCx expression on n pieces. Coefficients (n, num_coefficients), control points (n, 16, 3), values
+   (n, num_values), which are added to. */
+void thccs_tabulate(thccs_kernel *kernel, int32_t n, int32_t num_values, int32_t num_coefficients,
+                    const double *coefficients, const double *constants, const double *points, double *values);
+
+/* Bicubic patches in Bernstein form, coefficients (patches, 16, size), evaluated at the points uv (n, 2) of the
+   patches (n): the values, the derivatives along u and v, the second ones uu, uv, vv; the first `rows` (1, 3, 6)
+   of these. out (rows, n, size). */
+void thccs_evaluate_patches(int64_t n, const int32_t *patches, const double *uv, int32_t size,
+                            const double *coefficients, int32_t rows, double *out);

@@ -1,0 +1,541 @@
+"""One Catmull-Clark step on a mesh or on a part of it: child topology and the sparse matrix S.
+
+A `Level` is a set of faces of one subdivision level in half-edge form.  Half-edge `h` belongs to one face, starts at
+`vertices[h]` and runs to the start of `following[h]`; the half-edges of face `f` are `offsets[f] .. offsets[f + 1]`.  Only
+level 0 of a mesh with polygons has faces other than quads.
+
+After one step the vertices are ordered `[old vertices | edge points | face points]`.  The child at half-edge `h` is
+`[old vertex, edge point of h, face point, edge point of the half-edge before h]`: an extraordinary vertex is always
+corner 0 of its child, and orientation is kept.
+
+A level may be only a part of the surface.  What a vertex is on the whole surface (`num_faces`, `boundary`, `corner`) is
+therefore carried from level to level and never derived again: a vertex on the artificial rim of a part is no boundary
+vertex.  Rows of S for such vertices are placeholders (they sum to one); no one may use them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem.mesh import ControlMesh
+
+__all__ = [
+    "CHILD_AXES",
+    "CHILD_ORIGIN",
+    "Bools",
+    "Ints",
+    "Level",
+    "Step",
+    "child_at",
+    "control_level",
+    "in_quads",
+    "in_sub_quads",
+    "neighbourhood",
+    "subdivide",
+]
+
+INFINITE_SHARPNESS = 10.0  # at and above this a crease or corner never becomes smooth
+FAR = np.int32(1 << 30)  # rim distance of a vertex that has no irregular rim vertex in reach
+
+Ints = npt.NDArray[np.int32]
+Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Faces of one level, all of them or a part.
+
+    Attributes:
+        number: Level number; 0 is the coarsest.
+        offsets: First half-edge of each face, shape (num_faces + 1,).
+        vertices: Start vertex of each half-edge, shape (num_half_edges,).
+        twins: Opposite half-edge, or -1 on a real or an artificial rim, shape (num_half_edges,).
+        keys: Identity of each face on its level whatever part of the level is held: 4 * key of the parent + child;
+            ascending, shape (num_faces,), int64.
+        boundary_edge: Half-edge of the control mesh that a half-edge on the boundary of the surface descends from, -1 for
+            those inside, shape (num_half_edges,).
+        vertex_num_faces: Faces at each vertex, counted on the whole surface, shape (num_vertices,).
+        boundary: Vertices on the boundary of the surface, shape (num_vertices,).
+        corner: Boundary vertices that stay where they are: tagged corners and vertices of one face, (num_vertices,).
+        control_vertex: Vertex of level 0 that a vertex descends from, or -1, shape (num_vertices,).
+        rim_distance: Edges along the rim to the nearest irregular rim vertex (FAR inside), shape (num_vertices,).
+    """
+
+    number: int
+    offsets: Ints
+    vertices: Ints
+    twins: Ints
+    keys: npt.NDArray[np.int64]
+    boundary_edge: Ints
+    vertex_num_faces: Ints
+    boundary: Bools
+    corner: Bools
+    control_vertex: Ints
+    rim_distance: Ints
+
+    def __post_init__(self) -> None:
+        for value in self.__dict__.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+    @property
+    def num_faces(self) -> int:
+        """Number of faces held."""
+        return self.keys.size
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices held."""
+        return self.boundary.size
+
+    @cached_property
+    def face(self) -> Ints:
+        """Face of each half-edge, shape (num_half_edges,)."""
+        return np.repeat(np.arange(self.num_faces, dtype=np.int32), np.diff(self.offsets))
+
+    @cached_property
+    def following(self) -> Ints:
+        """Next half-edge around the same face, shape (num_half_edges,)."""
+        following = np.arange(1, self.vertices.size + 1, dtype=np.int32)
+        following[self.offsets[1:] - 1] = self.offsets[:-1]
+        return following
+
+    @cached_property
+    def previous(self) -> Ints:
+        """Half-edge before, around the same face, shape (num_half_edges,)."""
+        previous = np.arange(-1, self.vertices.size - 1, dtype=np.int32)
+        previous[self.offsets[:-1]] = self.offsets[1:] - 1
+        return previous
+
+    @cached_property
+    def rim(self) -> Bools:
+        """Half-edges on the boundary of the surface, shape (num_half_edges,)."""
+        return self.boundary_edge >= 0
+
+    @cached_property
+    def is_quad(self) -> bool:
+        """Whether every face has four corners."""
+        return bool((np.diff(self.offsets) == 4).all())
+
+    @property
+    def quads(self) -> Ints:
+        """Vertices of each face, shape (num_faces, 4); quadrilateral levels only."""
+        return self.vertices.reshape(-1, 4)
+
+    @cached_property
+    def regular(self) -> Bools:
+        """Vertices around which the limit surface is a bicubic B-spline, shape (num_vertices,).
+
+        Interior with four faces, on a smooth boundary with two, or a corner with one.
+        """
+        expected = np.where(self.boundary, np.where(self.corner, 1, 2), 4)
+        return self.vertex_num_faces == expected
+
+    @cached_property
+    def complete(self) -> Bools:
+        """Vertices all of whose faces are held, shape (num_vertices,)."""
+        return np.bincount(self.vertices, minlength=self.num_vertices) == self.vertex_num_faces
+
+    def half_edges(self, faces: npt.NDArray[np.integer]) -> Ints:
+        """Return the half-edges of the given faces, face by face."""
+        sizes = np.diff(self.offsets)[faces]
+        starts = np.repeat(self.offsets[:-1][faces], sizes)
+        ends = np.cumsum(sizes)
+        return (starts + np.arange(starts.size) - np.repeat(ends - sizes, sizes)).astype(np.int32)
+
+    def touching(self, vertices: Bools) -> Bools:
+        """Return the faces that have at least one of the marked vertices, shape (num_faces,)."""
+        hit = np.zeros(self.num_faces, dtype=bool)
+        hit[self.face[vertices[self.vertices]]] = True
+        return hit
+
+    def corners_of(self, faces: Bools) -> Bools:
+        """Return the vertices of the marked faces, shape (num_vertices,)."""
+        hit = np.zeros(self.num_vertices, dtype=bool)
+        hit[self.vertices[faces[self.face]]] = True
+        return hit
+
+
+def neighbourhood(level: Level, faces: Bools) -> Bools:
+    """Return the marked faces and all that touch them, shape (num_faces,)."""
+    return level.touching(level.corners_of(faces))
+
+
+def control_level(mesh: ControlMesh) -> Level:
+    """Return the whole control mesh as level 0; its vertices and faces keep their numbers.
+
+    Boundary vertices of a single face are corners, others where the mesh tags them with infinite sharpness.
+
+    Raises:
+        NotImplementedError: If the mesh has creases or finite corner sharpness, which the space does not support yet.
+    """
+    _refuse_unsupported_sharpness(mesh)
+    vertices = mesh.face_vertices
+    faces = np.diff(mesh.face_offsets)
+    following = np.arange(1, vertices.size + 1)
+    following[mesh.face_offsets[1:] - 1] = mesh.face_offsets[:-1]
+    twins = _twins(vertices, vertices[following], mesh.num_vertices)
+    rim = twins < 0
+    num_faces = np.bincount(vertices, minlength=mesh.num_vertices).astype(np.int32)
+    boundary = np.zeros(mesh.num_vertices, dtype=bool)
+    boundary[vertices[rim]] = True
+    corner = boundary & (num_faces == 1)
+    corner[[v for v, sharpness in mesh.corners.items() if boundary[v]]] = True
+    irregular_rim = boundary & (num_faces != np.where(corner, 1, 2))
+    return Level(
+        number=0,
+        offsets=mesh.face_offsets,
+        vertices=vertices,
+        twins=twins,
+        keys=np.arange(faces.size, dtype=np.int64),
+        boundary_edge=np.where(rim, np.arange(rim.size), -1).astype(np.int32),
+        vertex_num_faces=num_faces,
+        boundary=boundary,
+        corner=corner,
+        control_vertex=np.arange(mesh.num_vertices, dtype=np.int32),
+        rim_distance=_rim_distance(irregular_rim, vertices[rim], vertices[following][rim]),
+    )
+
+
+def _refuse_unsupported_sharpness(mesh: ControlMesh) -> None:
+    on_boundary = np.zeros(mesh.num_vertices, dtype=bool)
+    on_boundary[mesh.boundary_vertices] = True
+    boundary_edges = {(int(a), int(b)) for a, b in mesh.edges[mesh.boundary_edges]}
+    creases = [edge for edge, s in mesh.creases.items() if s > 0 and edge not in boundary_edges]
+    corners = [
+        v
+        for v, s in mesh.corners.items()
+        if s > 0 and not (on_boundary[v] and s >= INFINITE_SHARPNESS)
+    ]
+    if creases or corners:
+        what = f"crease at edge {creases[0]}" if creases else f"corner at vertex {corners[0]}"
+        raise NotImplementedError(
+            f"the control mesh has {len(creases)} creases inside the surface and {len(corners)} corners that are "
+            f"semi-sharp or inside the surface (first: {what}); only corners of sharpness >= "
+            f"{INFINITE_SHARPNESS:g} on the boundary are supported so far. Remove these tags to go on without them."
+        )
+
+
+def _twins(start: Ints, end: Ints, num_vertices: int) -> Ints:
+    """Return the opposite half-edge of each, -1 where there is none; the mesh is oriented and manifold."""
+    forward = start.astype(np.int64) * num_vertices + end
+    backward = end.astype(np.int64) * num_vertices + start
+    order = np.argsort(forward, kind="stable")
+    place = np.minimum(np.searchsorted(forward, backward, sorter=order), forward.size - 1)
+    candidate = order[place]
+    return np.where(forward[candidate] == backward, candidate, -1).astype(np.int32)
+
+
+def _rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:
+    """Return the distance along rim edges to the nearest irregular rim vertex: 0, 1, or FAR.
+
+    Further than 1 makes no difference (the tied zone is distance <= 1, and distances at least double with each level).
+    """
+    distance = np.full(irregular.size, FAR, dtype=np.int32)
+    distance[end[irregular[start]]] = 1
+    distance[start[irregular[end]]] = 1
+    distance[irregular] = 0
+    return distance
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One subdivision step from a level to the next.
+
+    Attributes:
+        fine: The children.
+        matrix: S, shape (fine.num_vertices, coarse vertices); rows sum to one.
+        first_child: First child of each coarse face (the child at half-edge offsets[f] + k is the first + k), -1 for
+            faces that were not subdivided, shape (coarse faces,).
+        old: Coarse vertex of each old vertex of the fine level, shape (num_old,).
+        edges: Coarse half-edge of each edge point, which follow the old vertices, shape (num_edge_points,).
+    """
+
+    fine: Level
+    matrix: sp.csr_array
+    first_child: Ints
+    old: Ints
+    edges: Ints
+
+
+def subdivide(level: Level, faces: Bools) -> Step:
+    """Subdivide the marked faces once by Catmull and Clark's rules.
+
+    Args:
+        level: The level that holds the faces.
+        faces: Marked faces, shape (level.num_faces,).
+    """
+    chosen = np.flatnonzero(faces).astype(np.int32)
+    half_edges = level.half_edges(chosen)
+    child = np.full(level.vertices.size, -1, dtype=np.int32)
+    child[half_edges] = np.arange(half_edges.size, dtype=np.int32)
+    old = np.flatnonzero(level.corners_of(faces)).astype(np.int32)
+    edge, edges = _number_edges(level, half_edges)
+    fine = _child_level(level, chosen, half_edges, child, old, edge, edges)
+    first_child = np.where(faces, child[level.offsets[:-1]], -1).astype(np.int32)
+    matrix = _step_matrix(level, chosen, half_edges, child, old, edges)
+    return Step(fine, matrix, first_child, old, edges)
+
+
+# Child k of a quad: parent (u, v) = CHILD_ORIGIN[k] + CHILD_AXES[k] @ child (u, v) / 2; axes in columns.
+CHILD_ORIGIN = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+CHILD_AXES = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], dtype=float)
+
+
+def child_at(uv: npt.NDArray[np.float64]) -> tuple[Ints, npt.NDArray[np.float64]]:
+    """Return the child of a quad that holds each point and the point's coordinates there.
+
+    Args:
+        uv: Points in [0, 1]^2, shape (n, 2).
+
+    Returns:
+        Child numbers 0 .. 3, shape (n,), and coordinates in [0, 1]^2 of the child, shape (n, 2).
+    """
+    right, upper = uv[:, 0] >= 0.5, uv[:, 1] >= 0.5
+    child = np.where(upper, np.where(right, 2, 3), np.where(right, 1, 0)).astype(np.int32)
+    # The axes are rotations: the inverse is the transpose.
+    return child, 2.0 * np.einsum("nji,nj->ni", CHILD_AXES[child], uv - CHILD_ORIGIN[child])
+
+
+def _number_edges(level: Level, half_edges: Ints) -> tuple[Ints, Ints]:
+    """Return the edge number of every half-edge (-1 outside) and the half-edge that stands for each edge."""
+    inside = np.zeros(level.vertices.size, dtype=bool)
+    inside[half_edges] = True
+    twins = level.twins[half_edges]
+    paired = (twins >= 0) & inside[twins]
+    leader = np.where(paired, np.minimum(half_edges, twins), half_edges)
+    edges = half_edges[leader == half_edges]
+    edge = np.full(level.vertices.size, -1, dtype=np.int32)
+    edge[edges] = np.arange(edges.size, dtype=np.int32)
+    edge[half_edges] = edge[leader]
+    return edge, edges
+
+
+def _child_level(
+    level: Level, chosen: Ints, half_edges: Ints, child: Ints, old: Ints, edge: Ints, edges: Ints
+) -> Level:
+    """Return the topology of the children; see `subdivide`."""
+    number_of_old = np.full(level.num_vertices, -1, dtype=np.int32)
+    number_of_old[old] = np.arange(old.size, dtype=np.int32)
+    face_number = np.full(level.num_faces, -1, dtype=np.int32)
+    face_number[chosen] = np.arange(chosen.size, dtype=np.int32)
+    previous = level.previous[half_edges]
+    faces = np.stack(
+        [
+            number_of_old[level.vertices[half_edges]],
+            old.size + edge[half_edges],
+            old.size + edges.size + face_number[level.face[half_edges]],
+            old.size + edge[previous],
+        ],
+        axis=1,
+    )
+    boundary_edge = np.full(faces.shape, -1, dtype=np.int32)
+    boundary_edge[:, 0], boundary_edge[:, 3] = level.boundary_edge[half_edges], level.boundary_edge[previous]
+    # Keys: a quad's child k is 4 * key + k; the children of a mesh with polygons are numbered by half-edge.
+    k = half_edges - level.offsets[level.face[half_edges]]
+    keys = 4 * level.keys[level.face[half_edges]] + k if level.is_quad else half_edges.astype(np.int64)
+    on_rim = level.rim[edges]
+    ends = level.rim_distance[np.stack([level.vertices[edges], level.vertices[level.following[edges]]])]
+    far = np.full(chosen.size, FAR, dtype=np.int32)
+    return Level(
+        number=level.number + 1,
+        offsets=np.arange(0, 4 * half_edges.size + 1, 4, dtype=np.int32),
+        vertices=faces.ravel(),
+        twins=_child_twins(level, half_edges, child),
+        keys=keys,
+        boundary_edge=boundary_edge.ravel(),
+        vertex_num_faces=np.concatenate(
+            [level.vertex_num_faces[old], np.where(on_rim, 2, 4), np.diff(level.offsets)[chosen]]
+        ).astype(np.int32),
+        boundary=np.concatenate([level.boundary[old], on_rim, np.zeros(chosen.size, dtype=bool)]),
+        corner=np.concatenate([level.corner[old], np.zeros(edges.size + chosen.size, dtype=bool)]),
+        control_vertex=np.concatenate(
+            [level.control_vertex[old], np.full(edges.size + chosen.size, -1, dtype=np.int32)]
+        ),
+        rim_distance=np.concatenate(
+            [
+                np.minimum(2 * level.rim_distance[old].astype(np.int64), FAR),
+                np.where(on_rim, np.minimum(2 * ends.min(axis=0).astype(np.int64) + 1, FAR), FAR),
+                far,
+            ]
+        ).astype(np.int32),
+    )
+
+
+def _child_twins(level: Level, half_edges: Ints, child: Ints) -> Ints:
+    """Return the twins of the children's half-edges, read off those of the parents."""
+
+    def through(half_edge: Ints, side: int) -> Ints:
+        """Return half-edge `side` of the child at the given parent half-edges, -1 where there is none."""
+        number = np.where(half_edge >= 0, child[half_edge], -1)
+        return np.where(number >= 0, 4 * number + side, -1)
+
+    before = level.previous[half_edges]
+    across = level.twins[half_edges]
+    twins = np.stack(
+        [
+            through(np.where(across >= 0, level.following[across], -1), 3),
+            through(level.following[half_edges], 2),
+            through(before, 1),
+            through(level.twins[before], 0),
+        ],
+        axis=1,
+    )
+    return twins.ravel().astype(np.int32)
+
+
+def _step_matrix(
+    level: Level, chosen: Ints, half_edges: Ints, child: Ints, old: Ints, edges: Ints
+) -> sp.csr_array:
+    """Return S, shape (old + edges + chosen, coarse vertices); see `subdivide`."""
+    num_vertices = level.num_vertices
+    sizes = np.diff(level.offsets)[chosen]
+    start = level.vertices[half_edges]
+    face_point = sp.csr_array(
+        (np.repeat(1.0 / sizes, sizes), start, np.concatenate([[0], np.cumsum(sizes)])),
+        shape=(chosen.size, num_vertices),
+    )
+    face_number = np.full(level.num_faces, -1, dtype=np.int32)
+    face_number[chosen] = np.arange(chosen.size, dtype=np.int32)
+    edge_rows = _edge_rows(level, edges, child, face_number, face_point)
+    vertex_rows = _vertex_rows(level, half_edges, old, face_number, face_point)
+    return sp.csr_array(sp.vstack([vertex_rows, edge_rows, face_point], format="csr"))
+
+
+def _edge_rows(
+    level: Level, edges: Ints, child: Ints, face_number: Ints, face_point: sp.csr_array
+) -> sp.csr_array:
+    """Edge points: mean of the ends and the two face points; midpoint on the rim."""
+    twins = level.twins[edges]
+    inner = np.flatnonzero((twins >= 0) & (child[twins] >= 0))
+    rows = np.arange(edges.size)
+    weight = np.full(edges.size, 0.5)
+    weight[inner] = 0.25
+    ends = sp.csr_array(
+        (
+            np.concatenate([weight, weight]),
+            (
+                np.concatenate([rows, rows]),
+                np.concatenate([level.vertices[edges], level.vertices[level.following[edges]]]),
+            ),
+        ),
+        shape=(edges.size, level.num_vertices),
+    )
+    sides = sp.csr_array(
+        (
+            np.full(2 * inner.size, 0.25),
+            (
+                np.concatenate([inner, inner]),
+                face_number[level.face[np.concatenate([edges[inner], twins[inner]])]],
+            ),
+        ),
+        shape=(edges.size, face_point.shape[0]),
+    )
+    return ends + sides @ face_point
+
+
+def _vertex_rows(
+    level: Level, half_edges: Ints, old: Ints, face_number: Ints, face_point: sp.csr_array
+) -> sp.csr_array:
+    """Vertex points: ((n - 3) P + mean face point + 2 mean edge midpoint) / n inside, (1 6 1) / 8 on a smooth rim.
+
+    Corners stay; so do vertices whose surroundings are not all in this part (placeholders).
+    """
+    num_vertices = level.num_vertices
+    start = level.vertices[half_edges]
+    count = np.bincount(start, minlength=num_vertices)
+    n = level.vertex_num_faces.astype(np.float64)
+    inner = ~level.boundary & (count == level.vertex_num_faces)
+    corners = half_edges[inner[start]]
+    v = level.vertices[corners]
+    per_face = 1.0 / n[v] ** 2
+    around = sp.csr_array((per_face, (v, face_number[level.face[corners]])), shape=(num_vertices, face_point.shape[0]))
+    # Each edge at v is met from both its faces: half of each midpoint from either side.
+    rim = half_edges[level.rim[half_edges]]
+    a, b = level.vertices[rim], level.vertices[level.following[rim]]
+    ends = np.bincount(np.concatenate([a, b]), minlength=num_vertices)
+    smooth = level.boundary & ~level.corner & (ends == 2)
+    a_smooth, b_smooth = smooth[a], smooth[b]
+    everyone = np.arange(num_vertices)
+    rows = np.concatenate([everyone, v, v, v, a[a_smooth], b[b_smooth]])
+    columns = np.concatenate(
+        [
+            everyone,
+            v,
+            level.vertices[level.following[corners]],
+            level.vertices[level.previous[corners]],
+            b[a_smooth],
+            a[b_smooth],
+        ]
+    )
+    own = np.where(inner, (n - 3.0) / n, np.where(smooth, 0.75, 1.0))
+    eighth = np.full(np.count_nonzero(a_smooth) + np.count_nonzero(b_smooth), 0.125)
+    values = np.concatenate([own, per_face, 0.5 * per_face, 0.5 * per_face, eighth])
+    local = sp.csr_array((values, (rows, columns)), shape=(num_vertices, num_vertices))
+    return (local + around @ face_point)[old]
+
+
+def in_sub_quads(
+    mesh: ControlMesh, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+) -> tuple[Ints, npt.NDArray[np.float64]]:
+    """Return the child of the first subdivision that holds each point and the point's coordinates there.
+
+    Args:
+        mesh: The control mesh.
+        faces: Faces of the mesh, shape (n,).
+        uv: Coordinates in [0, 1]^2, shape (n, 2): of the face, u along its edge from corner 0 to 1 and v from corner 0 to
+            3; or, where `corner` names one, of the sub-quad there: (0, 0) the corner, u towards the next one, (1, 1) the
+            face point.
+        corner: Corner of the face, -1 for none, shape (n,); faces that are no quads need one.
+
+    Returns:
+        Half-edges of the mesh (the child at half-edge h has number h), shape (n,), and coordinates, shape (n, 2).
+
+    Raises:
+        ValueError: If an argument is out of range, or a corner is missing.
+    """
+    faces, uv, corner = _checked_positions(mesh, faces, uv, corner)
+    child, inner = child_at(uv)
+    whole = corner < 0
+    half_edge = mesh.face_offsets[faces] + np.where(whole, child, corner)
+    return half_edge.astype(np.int32), np.where(whole[:, None], inner, uv)
+
+
+def in_quads(
+    mesh: ControlMesh, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+) -> tuple[Ints, npt.NDArray[np.float64]]:
+    """Return the face and the coordinates of points in faces that are quads; arguments as for `in_sub_quads`."""
+    faces, uv, corner = _checked_positions(mesh, faces, uv, corner)
+    outer = CHILD_ORIGIN[corner] + np.einsum("nij,nj->ni", CHILD_AXES[corner], uv) / 2.0
+    return faces, np.where((corner < 0)[:, None], uv, outer)
+
+
+def _checked_positions(
+    mesh: ControlMesh, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None
+) -> tuple[Ints, npt.NDArray[np.float64], Ints]:
+    faces = np.atleast_1d(np.asarray(faces))
+    uv = np.asarray(uv, dtype=np.float64)
+    corner = np.full(faces.shape, -1) if corner is None else np.broadcast_to(corner, faces.shape)
+    if not np.issubdtype(faces.dtype, np.integer) or not np.issubdtype(corner.dtype, np.integer):
+        raise TypeError(f"faces and corner must be integers, got {faces.dtype} and {corner.dtype}")
+    if uv.shape != (*faces.shape, 2) or faces.ndim != 1:
+        raise ValueError(f"uv must have shape ({faces.size}, 2), two coordinates for each of the faces; got {uv.shape}")
+    bad = np.flatnonzero((faces < 0) | (faces >= mesh.num_faces))
+    if bad.size:
+        raise ValueError(f"point {bad[0]} is on face {faces[bad[0]]}; the mesh has faces 0 to {mesh.num_faces - 1}")
+    sizes = mesh.face_sizes[faces]
+    bad = np.flatnonzero((corner >= sizes) | ((corner < 0) & (sizes != 4)))
+    if bad.size:
+        raise ValueError(
+            f"point {bad[0]} is on face {faces[bad[0]]} with {sizes[bad[0]]} corners and names corner {corner[bad[0]]}; "
+            f"a face that is no quad needs a corner from 0 to {sizes[bad[0]] - 1} for each of its points"
+        )
+    bad = np.flatnonzero(~((uv >= 0.0) & (uv <= 1.0)).all(axis=1))
+    if bad.size:
+        raise ValueError(f"point {bad[0]} has coordinates {uv[bad[0]]}; both must lie in [0, 1]")
+    return faces.astype(np.int32), uv, corner.astype(np.int32)
