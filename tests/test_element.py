@@ -2,7 +2,6 @@
 
 from fractions import Fraction
 
-import basix.ufl
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -74,27 +73,11 @@ def test_constants_of_the_module_are_read_only() -> None:
 
 
 @pytest.mark.parametrize("shape", [(), (2,), (3,), (2, 2)])
-def test_blocked_elements_are_made_once_and_known(shape: tuple[int, ...]) -> None:
+def test_blocked_elements_are_made_once(shape: tuple[int, ...]) -> None:
     assert element.blocked(shape) is element.blocked(shape)
-    assert element.is_ours(element.blocked(shape))
     assert element.blocked(shape).dim == 16 * int(np.prod(shape, dtype=int))
     assert element.blocked(shape).reference_value_shape == shape
 
 
 def test_coordinate_element_has_a_component_for_each_dimension() -> None:
     assert element.coordinate_element(3) is element.blocked((3,))
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        basix.ufl.element("Lagrange", "quadrilateral", 3),
-        basix.ufl.element("Lagrange", "quadrilateral", 3, shape=(3,)),
-        basix.ufl.element("Lagrange", "triangle", 1),
-        basix.ufl.mixed_element([element.bspline(), element.bspline()]),
-        basix.ufl.blocked_element(element.bspline(), shape=(2, 2), symmetry=True),
-    ],
-    ids=["Q3", "vector Q3", "P1", "mixed", "symmetric"],
-)
-def test_other_elements_are_not_ours(other: basix.ufl._ElementBase) -> None:
-    assert not element.is_ours(other)

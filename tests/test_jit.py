@@ -78,6 +78,21 @@ def test_what_a_killed_process_left_is_no_obstacle(filled_cache: Path, tmp_path:
     assert output(COMPILE, THCCS_CACHE=tmp_path) == (0, "")
 
 
+def test_without_locks_the_first_one_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("THCCS_CACHE", str(tmp_path))
+    monkeypatch.setattr(jit, "fcntl", None)
+
+    def build_twice(path: Path) -> None:
+        """Build while another process puts its copy into place."""
+        (path / "mine").touch()
+        others = jit.cache_directory() / "module"
+        others.mkdir()
+        (others / "theirs").touch()
+
+    assert [path.name for path in jit._built("module", build_twice).iterdir()] == ["theirs"]
+    assert not list(tmp_path.glob("*/build-*"))
+
+
 def test_missing_compiler_is_named(tmp_path: Path) -> None:
     code, text = output(COMPILE, THCCS_CACHE=tmp_path, CC="no-such-compiler")
     assert code != 0
@@ -95,13 +110,14 @@ def test_failing_compiler_is_named(tmp_path: Path) -> None:
 def test_cache_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("THCCS_CACHE", str(tmp_path / "file"))
-    with pytest.raises(OSError, match=r"compiled code can't be kept in .*file.*Set the environment variable THCCS_CACHE"):
+    with pytest.raises(OSError, match=r"compiled code can't be kept in .*file.*variable THCCS_CACHE"):
         jit.library.__wrapped__()
 
 
 def test_options_of_ffcx_in_the_working_directory_do_not_matter(tmp_path: Path) -> None:
     (tmp_path / "ffcx_options.json").write_text('{"scalar_type": "float32", "verbosity": 10}')
-    assert output(f"import os; os.chdir({str(tmp_path)!r})\n" + textwrap.dedent(COMPILE), THCCS_CACHE=tmp_path) == (0, "")
+    there = f"import os; os.chdir({str(tmp_path)!r})\n"
+    assert output(there + textwrap.dedent(COMPILE), THCCS_CACHE=tmp_path) == (0, "")
 
 
 @pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="other platforms have other places")

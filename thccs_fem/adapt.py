@@ -27,7 +27,7 @@ Strategy = Literal["worst", "maximum", "dorfler"]
 
 
 def mark(
-    V: FunctionSpace, eta: Floats, *, strategy: Strategy = "dorfler", theta: float = 0.5
+    V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: float = 0.5
 ) -> npt.NDArray[np.int64]:
     """Mark functions for refinement.
 

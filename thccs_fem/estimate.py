@@ -33,7 +33,7 @@ def error(
     Args:
         uh: The approximation.
         u_exact: The exact solution: a UFL expression, or a function that makes one of the spatial coordinate.
-        norm: "L2", or "H1" (the full norm: values and gradients).
+        norm: "L2", or "H1" (the full norm: values and gradients along the surface).
 
     Returns:
         Shape (num_cells,), local.
@@ -48,7 +48,8 @@ def error(
     e = uh - exact
     density = ufl.inner(e, e)
     if norm == "H1":
-        density += ufl.inner(ufl.grad(e), ufl.grad(e))
+        gradient = _tangential(V, ufl.grad(e))
+        density += ufl.inner(gradient, gradient)
     return np.sqrt(np.maximum(_over_cells(V, density), 0.0))
 
 
@@ -78,6 +79,18 @@ def residual(uh: Function, strong_residual: ufl.core.expr.Expr, neumann: ufl.cor
 def norm(V: FunctionSpace, eta: Floats) -> float:
     """Return the root of the sum of the squared indicators, over all ranks."""
     return float(np.sqrt(np.sum(np.asarray(eta) ** 2)))
+
+
+def _tangential(V: FunctionSpace, gradient: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
+    """Return the part of a gradient that is tangential to the surface.
+
+    That of a THCCS function is tangential already, but UFL's gradient of an expression in the spatial coordinate is the one
+    in space: on a surface the difference of the two has a normal part, which has nothing to do with the error.
+    """
+    if V.mesh.gdim == 2:
+        return gradient
+    domain = V.mesh.ufl_domain()
+    return ufl.dot(gradient, ufl.Jacobian(domain) * ufl.JacobianInverse(domain))  # J times its pseudo-inverse
 
 
 def _over_cells(V: FunctionSpace, density: ufl.core.expr.Expr) -> Floats:

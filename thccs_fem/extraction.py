@@ -13,14 +13,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from thccs_fem import element
+from thccs_fem import element, jit
 from thccs_fem.bezier import bezier_masks, spline_grid
 from thccs_fem.hierarchy import Hierarchy, Stage
+from thccs_fem.limit import evaluate_patches
 from thccs_fem.subdivision import CHILD_AXES, CHILD_ORIGIN, Bools, Ints, child_at
 
 __all__ = ["Batch", "Cells", "evaluate_pieces", "extract"]
@@ -226,9 +228,7 @@ def evaluate_pieces(local: Floats, piece: Ints, uv: Floats) -> Floats:
     Returns:
         Values, shape (n, k).
     """
-    along_u, along_v = element.bspline_values(uv[:, 0]), element.bspline_values(uv[:, 1])
-    basis = (along_v[:, :, None] * along_u[:, None, :]).reshape(-1, 16)
-    return np.einsum("ni,nik->nk", basis, local[piece])
+    return evaluate_patches(piece, uv, element.TO_BERNSTEIN @ local)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,31 +388,54 @@ def _general_batches(cell: Ints, nodes: Ints, rows: sp.csr_array, pieces: Ints) 
     """Return batches of dense operators for the given pieces, which are sorted by cell, and their pieces."""
     if not pieces.size:
         return [], []
-    cells, first, count = np.unique(cell, return_index=True, return_counts=True)
-    number = np.repeat(np.arange(cells.size), count)
+    cells, first, count = (a.astype(np.int32) for a in np.unique(cell, return_index=True, return_counts=True))
     entries = sp.csr_array(rows[(16 * pieces[:, None] + np.arange(16)).ravel()])
-    row = np.repeat(np.arange(entries.shape[0]), np.diff(entries.indptr))
-    pair = number[row // 16].astype(np.int64) * rows.shape[1] + entries.indices
-    dofs_of_cells, column = np.unique(pair, return_inverse=True)
-    owner = dofs_of_cells // rows.shape[1]
-    size = np.bincount(owner, minlength=cells.size)
-    start = np.cumsum(size) - size
+    entries.sort_indices()
+    entries.indptr, entries.indices = entries.indptr.astype(np.int32), entries.indices.astype(np.int32)
+    cell_rows = 16 * np.append(first, np.int32(pieces.size))
+    offsets, dofs = _dofs_of_cells(entries, cell_rows)
+    size = np.diff(offsets)
     width = -(-size // WIDTH) * WIDTH
-    batches, order = [], []
+    # Blocks of equal width follow one another, so that each batch is one piece of memory.
+    order = np.argsort(width, kind="stable")
+    blocks = 16 * count[order].astype(np.int64) * width[order]
+    starts = np.zeros(cells.size, dtype=np.int64)
+    starts[order] = np.cumsum(blocks) - blocks
+    values = np.zeros(blocks.sum())
+    _run("thccs_dense_rows", cells.size, cell_rows, entries, entries.data, offsets, dofs, width, starts, values)
+    batches, batch_pieces = [], []
     for w in np.unique(width):
-        chosen = np.flatnonzero(width == w)
-        place = np.full(cells.size, -1)
-        place[chosen] = np.arange(chosen.size)
-        offsets = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
-        of_batch = np.repeat(first[chosen] - offsets[:-1], count[chosen]) + np.arange(offsets[-1])
-        dofs = np.full((chosen.size, w), -1, dtype=np.int32)
-        mine = place[owner] >= 0
-        dofs[place[owner[mine]], (np.arange(owner.size) - start[owner])[mine]] = (dofs_of_cells % rows.shape[1])[mine]
-        operators = np.zeros((of_batch.size, 16, w))
-        piece_place = np.full(pieces.size, -1)
-        piece_place[of_batch] = np.arange(of_batch.size)
-        e = np.flatnonzero(piece_place[row // 16] >= 0)
-        operators[piece_place[row[e] // 16], row[e] % 16, column[e] - start[number[row[e] // 16]]] = entries.data[e]
-        batches.append(Batch(cells[chosen], dofs, offsets, nodes[of_batch], operators))
-        order.append(pieces[of_batch])
-    return batches, order
+        chosen = order[width[order] == w]
+        local_offsets = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
+        mine = np.repeat(first[chosen] - local_offsets[:-1], count[chosen]) + np.arange(local_offsets[-1])
+        padded = np.full((chosen.size, w), -1, dtype=np.int32)
+        padded[np.arange(w) < size[chosen, None]] = dofs[np.isin(np.repeat(np.arange(cells.size), size), chosen)]
+        begin = starts[chosen[0]]
+        operators = values[begin : begin + 16 * mine.size * w].reshape(mine.size, 16, w)
+        batches.append(Batch(cells[chosen], padded, local_offsets, nodes[mine], operators))
+        batch_pieces.append(pieces[mine])
+    return batches, batch_pieces
+
+
+def _dofs_of_cells(entries: sp.csr_array, cell_rows: Ints) -> tuple[Ints, Ints]:
+    """Return offsets, shape (cells + 1,), and the ascending dofs that occur in the rows of each cell."""
+    num_cells = cell_rows.size - 1
+    counts = np.zeros(num_cells, dtype=np.int32)
+    seen = np.full(entries.shape[1], -1, dtype=np.int32)
+    _run("thccs_cell_columns", num_cells, cell_rows, entries, seen, counts, None, None)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+    dofs = np.zeros(offsets[-1], dtype=np.int32)
+    seen[:] = -1
+    _run("thccs_cell_columns", num_cells, cell_rows, entries, seen, counts, offsets, dofs)
+    return offsets, dofs
+
+
+def _run(function: str, num_cells: int, cell_rows: Ints, entries: sp.csr_array, *arrays: npt.NDArray[Any] | None) -> None:
+    """Call a loop of kernels.c on the rows of cells."""
+    module = jit.library()
+    c_types = {"i4": "int32_t[]", "i8": "int64_t[]", "f8": "double[]"}
+    pointers = [
+        module.ffi.NULL if a is None else module.ffi.from_buffer(c_types[a.dtype.str[1:]], a)
+        for a in (cell_rows, entries.indptr, entries.indices, *arrays)
+    ]
+    getattr(module.lib, function)(num_cells, *pointers)

@@ -22,8 +22,8 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 
-from thccs_fem import subdivision
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.subdivision import subdivided
 
 __all__ = [
     "cube_sphere",
@@ -152,8 +152,8 @@ def genus3(levels: int = 3, *, comm: Any = None) -> ControlMesh:
     # After one step the child at corner k of face f is face 4 f + k.
     children = base.face_vertices
     tags = np.where(children == left, 1, np.where(children == right, 2, 0))
-    vertices, faces = _subdivided(base, levels)
-    return ControlMesh(vertices, faces, np.repeat(tags, 4 ** (levels - 1)), comm=comm)
+    once = subdivided(base)
+    return subdivided(ControlMesh(once.vertices, once.quads, tags, comm=comm), levels - 1)
 
 
 def _genus3_tubes() -> list[Floats]:
@@ -182,15 +182,6 @@ def _four_quarters(quarter: Floats) -> Floats:
 def _strip(upper: Floats, middle: Floats) -> Floats:
     """Return the block from the mirror image of the upper polygon in z = 0 to the polygon."""
     return np.stack([upper * [1.0, 1.0, -1.0], middle, upper])
-
-
-def _subdivided(mesh: ControlMesh, levels: int) -> tuple[Floats, Ints]:
-    """Return vertices and quads of a mesh after some Catmull-Clark steps."""
-    level, vertices = subdivision.control_level(mesh), mesh.vertices
-    for _ in range(levels):
-        step = subdivision.subdivide(level, np.ones(level.num_faces, dtype=bool))
-        level, vertices = step.fine, step.matrix @ vertices
-    return vertices, level.quads
 
 
 # Planar domains

@@ -27,6 +27,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
+from scipy.sparse import csgraph
 
 from thccs_fem.boundary import (
     Boundary,
@@ -124,6 +125,7 @@ class Hierarchy:
     ) -> Self:
         keys = tuple(k for k in refined_keys if k.size)
         caps = _cap_levels(root, keys, cap_level)
+        _check_depth(root, max(int(caps.max()), len(keys)))
         return cls(mesh, rule, cap_level, keys, root, tuple(_stages(root, rule, keys, caps)))
 
     @property
@@ -205,7 +207,6 @@ class Hierarchy:
         keys: list[Keys] = [*self.refined_keys, np.zeros(0, dtype=np.int64)]
         for l, support in enumerate(self.support(dofs)):
             keys[l] = np.union1d(keys[l], self.stages[l].level.keys[support])
-        _check_depth(self.root, len(keys))
         return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
 
     def truncated_to(self, num_levels: int) -> Self:
@@ -244,8 +245,12 @@ class Hierarchy:
 
 
 def _is_dependent(root: Level) -> bool:
-    """Return whether a closed mesh has only vertices of valence 3: S annihilates the alternating vector (Peters, Wu)."""
-    return bool((root.vertex_num_faces == 3).all() and not root.boundary.any())
+    """Return if a closed component has only vertices of valence 3: S annihilates an alternating vector (Peters, Wu)."""
+    ends = (root.vertices, root.vertices[root.following])
+    graph = sp.csr_array((np.ones(root.vertices.size, dtype=bool), ends), shape=(root.num_vertices,) * 2)
+    component = csgraph.connected_components(graph, directed=False)[1]
+    others = component[(root.vertex_num_faces != 3) | root.boundary]
+    return bool(np.setdiff1d(component, others).size)
 
 
 def _as_level_zero(level: Level) -> Level:
@@ -253,9 +258,12 @@ def _as_level_zero(level: Level) -> Level:
     return replace(level, number=0, control_vertex=np.arange(level.num_vertices, dtype=np.int32))
 
 
-def _check_depth(root: Level, num_levels: int) -> None:
-    if (int(root.keys[-1]) + 1) * 4 ** (num_levels + 1) >= 2**62:
-        raise ValueError(f"{num_levels} levels on {root.num_faces} faces are more than 64-bit face keys can number")
+def _check_depth(root: Level, deepest: int) -> None:
+    if root.num_faces * 4**deepest >= 2**62:
+        raise ValueError(
+            f"{deepest} levels below the {root.num_faces} faces of level 0 are more than 64-bit face keys can number: "
+            f"refine less or choose a smaller cap_level"
+        )
 
 
 def _cap_levels(root: Level, refined_keys: Sequence[Keys], least: int) -> Ints:

@@ -246,13 +246,10 @@ def _obj_face(path: Path, line: int, words: list[str], num_vertices: int) -> lis
     """Return the corners, counted from 0, of a face that comes after so many vertices."""
     what = f"in the face {' '.join(words)!r} the vertex"
     numbers = _integers(path, line, [word.partition("/")[0] for word in words], what)
-    if any(number == 0 or number < -num_vertices for number in numbers):
-        _fail(
-            path,
-            line,
-            f"a face has the vertex {min(numbers, key=abs) if 0 in numbers else min(numbers)}; OBJ "
-            f"counts from 1, or from -1 backwards to -{num_vertices} here",
-        )
+    wrong = [number for number in numbers if number == 0 or number < -num_vertices]
+    if wrong:
+        counts = f"OBJ counts from 1, or backwards from -1 to -{num_vertices} here"
+        _fail(path, line, f"a face has the vertex {wrong[0]}; {counts}")
     return [number - 1 if number > 0 else number + num_vertices for number in numbers]
 
 
@@ -260,9 +257,11 @@ def _obj_face(path: Path, line: int, words: list[str], num_vertices: int) -> lis
 
 
 def _read_off(path: Path) -> _Surface:
-    (line, words), *rows = _statements(_lines(_bytes(path)))
-    line, counts, rows = _off_counts(path, line, words, rows)
-    num_vertices, num_faces = counts
+    rows = list(_statements(_lines(_bytes(path))))
+    if not rows:
+        raise ValueError(f"{path}: there are only comments in the file")
+    counts, rows = _off_counts(path, rows)
+    line, (num_vertices, num_faces) = counts
     if len(rows) != num_vertices + num_faces:
         _fail(
             path,
@@ -276,17 +275,14 @@ def _read_off(path: Path) -> _Surface:
     return _Surface(np.array(vertices).reshape(-1, 3), faces)
 
 
-def _off_counts(path: Path, line: int, words: list[str], rows: list[Line]) -> tuple[int, list[int], list[Line]]:
-    """Return the line of the counts, the numbers of vertices and faces, and the rows after it."""
-    keyword, *counts = words
+def _off_counts(path: Path, rows: list[Line]) -> tuple[tuple[int, list[int]], list[Line]]:
+    """Return the line of the counts and the numbers of vertices and faces, and the rows after."""
+    (line, (keyword, *counts)), *rows = rows
     # ST: texture coordinates, C: colours, N: normals, all after x y z; 4 and n: other than x y z.
     if not re.fullmatch("(ST)?C?N?OFF", keyword) or counts[:1] == ["BINARY"]:
-        _fail(
-            path,
-            line,
-            f"the file begins with {' '.join(words)!r}; expected OFF (or COFF, NOFF, STOFF), as "
-            f"text and with three coordinates",
-        )
+        begin = " ".join([keyword, *counts])[:60]
+        expected = "expected OFF (or COFF, NOFF, STOFF), as text and with three coordinates"
+        _fail(path, line, f"the file begins with {begin!r}; {expected}")
     if not counts and rows:
         (line, counts), *rows = rows
     if len(counts) < 2:
@@ -294,7 +290,7 @@ def _off_counts(path: Path, line: int, words: list[str], rows: list[Line]) -> tu
     numbers = _integers(path, line, counts[:2], "the count of vertices and faces")
     if min(numbers) < 0:
         _fail(path, line, f"the counts of vertices and faces are {numbers}: one is negative")
-    return line, numbers, rows
+    return (line, numbers), rows
 
 
 def _off_face(path: Path, line: int, words: list[str]) -> list[int]:
@@ -387,10 +383,19 @@ def _ply_header(path: Path, data: bytes) -> _PlyHeader:
                 types = _PLY_TYPES[kind], _PLY_TYPES[length]
                 elements[-1].properties.append(_PlyProperty(name, *types))
             case ["end_header"] if order is not None:
+                _check_ply_names(path, line, elements)
                 return _PlyHeader(order, elements, line, start)
             case _:
                 _fail(path, line, f"{text[:60]!r} is not what a PLY header has there")
     raise ValueError(f"{path}: the PLY header has no end (end_header): file cut off?")
+
+
+def _check_ply_names(path: Path, line: int, elements: list[_PlyElement]) -> None:
+    """Raise ValueError unless elements and the properties of each have different names."""
+    properties = [[p.name for p in element.properties] for element in elements]
+    for names in ([element.name for element in elements], *properties):
+        if not names or len(set(names)) < len(names):
+            _fail(path, line, "a name is there twice, or an element without properties, above")
 
 
 def _ply_text(path: Path, data: bytes, header: _PlyHeader) -> dict[str, dict[str, Any]]:
@@ -427,7 +432,7 @@ def _ply_text_rows(path: Path, element: _PlyElement, rows: list[Line]) -> dict[s
                     columns[p.name].append([kind(next(rest)) for _ in range(size)])
                 else:
                     columns[p.name].append(kind(next(rest)))
-        except (StopIteration, RuntimeError):
+        except StopIteration:
             _fail(path, line, f"too few values for the properties of a {element.name}")
         except ValueError as error:
             _fail(path, line, f"{error}; expected the properties of a {element.name}", error)

@@ -26,10 +26,11 @@ from types import ModuleType
 from typing import Any
 
 import cffi
-import ffcx.codegeneration.jit
-import ffcx.naming
 import numpy as np
 import numpy.typing as npt
+
+import ffcx.codegeneration.jit
+import ffcx.naming
 import ufl
 
 try:
@@ -85,14 +86,7 @@ def compile_forms(forms: Sequence[ufl.Form]) -> tuple[list[Any], ModuleType]:
         OSError: There is no C compiler, or the cache can't be written.
         RuntimeError: The C compiler failed.
     """
-    options = {"options": OPTIONS, "cffi_extra_compile_args": list(FLAGS)}
-    name = "forms_" + ffcx.naming.compute_signature(list(forms), str(sorted(OPTIONS.items())))
-    directory = _built(
-        name,
-        lambda path: ffcx.codegeneration.jit.compile_forms(list(forms), cache_dir=path, **options),
-    )
-    compiled, module, _ = ffcx.codegeneration.jit.compile_forms(list(forms), cache_dir=directory, **options)
-    return compiled, module
+    return _compiled_by_ffcx(ffcx.codegeneration.jit.compile_forms, "forms", list(forms))
 
 
 def compile_expression(expression: ufl.core.expr.Expr, points: npt.NDArray[np.float64]) -> tuple[Any, ModuleType]:
@@ -109,13 +103,18 @@ def compile_expression(expression: ufl.core.expr.Expr, points: npt.NDArray[np.fl
         OSError: There is no C compiler, or the cache can't be written.
         RuntimeError: The C compiler failed.
     """
-    options = {"options": OPTIONS, "cffi_extra_compile_args": list(FLAGS)}
-    what = [(expression, points)]
-    name = "expression_" + ffcx.naming.compute_signature(what, str(sorted(OPTIONS.items())))
     compiler = ffcx.codegeneration.jit.compile_expressions
-    directory = _built(name, lambda path: compiler(what, cache_dir=path, **options))
-    compiled, module, _ = compiler(what, cache_dir=directory, **options)
-    return compiled[0], module
+    (compiled,), module = _compiled_by_ffcx(compiler, "expression", [(expression, points)])
+    return compiled, module
+
+
+def _compiled_by_ffcx(compiler: Callable[..., Any], kind: str, objects: list[Any]) -> tuple[list[Any], ModuleType]:
+    """Return what one of FFCx's compilers makes of the objects, from the cache if it is there."""
+    options: dict[str, Any] = {"options": OPTIONS, "cffi_extra_compile_args": list(FLAGS)}
+    name = f"{kind}_{ffcx.naming.compute_signature(objects, str(sorted(OPTIONS.items())))}"
+    directory = _built(name, lambda path: compiler(objects, cache_dir=path, **options))
+    compiled, module, _ = compiler(objects, cache_dir=directory, **options)
+    return compiled, module
 
 
 @functools.cache
@@ -135,9 +134,7 @@ def library() -> ModuleType:
     def build(path: Path) -> None:
         builder = cffi.FFI()
         builder.cdef(header)
-        builder.set_source(
-            name, source, include_dirs=[str(package)], extra_compile_args=["-std=c17", *FLAGS]
-        )
+        builder.set_source(name, source, include_dirs=[str(package)], extra_compile_args=["-std=c17", *FLAGS])
         builder.compile(tmpdir=str(path))
 
     return _load(name, _built(name, build))
@@ -187,14 +184,24 @@ def _built(name: str, build: Callable[[Path], object]) -> Path:
             if not target.is_dir():
                 with tempfile.TemporaryDirectory(prefix="build-", dir=target.parent) as scratch:
                     _run_compiler(build, Path(scratch, name))
-                    with contextlib.suppress(FileExistsError):  # no lock to be had, and another was first
-                        Path(scratch, name).rename(target)
-    except (PermissionError, NotADirectoryError, FileExistsError) as error:
+                    _move(Path(scratch, name), target)
+    except OSError as error:
+        if error.errno is None:  # not the system's: no compiler
+            raise
         raise OSError(
             f"compiled code can't be kept in {target.parent}: {error}. "
             f"Set the environment variable THCCS_CACHE to a directory that can be written."
         ) from error
     return target
+
+
+def _move(source: Path, target: Path) -> None:
+    """Rename a directory, unless another process was first (which can be where there are no locks)."""
+    try:
+        source.rename(target)
+    except OSError:
+        if not target.is_dir():
+            raise
 
 
 @contextlib.contextmanager

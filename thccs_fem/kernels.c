@@ -17,8 +17,9 @@ typedef struct {
   double *piece_coefficients; /* (16, block size) of each coefficient in turn */
   double *piece_tensor;
   double *cell_tensor;
-  double *half;  /* (16, width): A^T C */
-  double *block; /* (16, 16): one pair of components of piece_tensor */
+  double *block;   /* (16, 16): one pair of components of piece_tensor, A */
+  double *half;    /* (16, width): A^T C */
+  double *product; /* (width, width): C^T A C */
 } workspace;
 
 /* Return the allocation, to be freed, or NULL. */
@@ -30,9 +31,9 @@ static void *make_workspace(workspace *work, const thccs_batch *batch, const thc
     block_sizes += integral->block_sizes[i];
   const int64_t w = batch->width;
   const int64_t sizes[] = {w * block_sizes, LOCAL * block_sizes, LOCAL * LOCAL * components, w * w * components,
-                           LOCAL * w, LOCAL * LOCAL};
+                           LOCAL * LOCAL, LOCAL * w, w * w};
   int64_t total = 0;
-  for (int i = 0; i < 6; ++i)
+  for (int i = 0; i < 7; ++i)
     total += sizes[i];
   void *memory = calloc(total + 8, sizeof(double));
   if (!memory)
@@ -40,8 +41,9 @@ static void *make_workspace(workspace *work, const thccs_batch *batch, const thc
   double *next = (double *)(((uintptr_t)memory + 63) / 64 * 64);
   memset(work->points, 0, sizeof work->points);
   double **parts[] = {&work->cell_coefficients, &work->piece_coefficients, &work->piece_tensor,
-                      &work->cell_tensor,       &work->half,               &work->block};
-  for (int i = 0; i < 6; ++i) {
+                      &work->cell_tensor,       &work->block,              &work->half,
+                      &work->product};
+  for (int i = 0; i < 7; ++i) {
     *parts[i] = next;
     next += sizes[i];
   }
@@ -186,30 +188,30 @@ static void add_product(int32_t m, int32_t n, const double *restrict x, const do
     }
 }
 
-/* work->cell_tensor (rows, columns, width, width) += C^T A C for each pair of components of the piece's A. */
+/* work->cell_tensor (width, rows, width, columns) += C^T A C for each pair of components of the piece's A. */
 static void add_extracted(int32_t rows, int32_t columns, int32_t width, const double *operator, workspace *work)
 {
   for (int32_t r = 0; r < rows; ++r)
     for (int32_t c = 0; c < columns; ++c) {
       const double *block = work->piece_tensor;
+      double *product = work->cell_tensor;
       if (rows * columns > 1) {
-        for (int i = 0; i < LOCAL; ++i)
-          for (int j = 0; j < LOCAL; ++j)
-            work->block[LOCAL * i + j] =
-                work->piece_tensor[((int64_t)i * rows + r) * LOCAL * columns + j * columns + c];
+        for (int32_t i = 0; i < LOCAL; ++i)
+          for (int32_t j = 0; j < LOCAL; ++j)
+            work->block[LOCAL * i + j] = work->piece_tensor[((i * rows + r) * LOCAL + j) * columns + c];
+        memset(work->product, 0, width * width * sizeof(double));
         block = work->block;
+        product = work->product;
       }
       memset(work->half, 0, LOCAL * width * sizeof(double));
       add_product(LOCAL, width, block, operator, work->half);
-      add_product(width, width, work->half, operator, work->cell_tensor + (int64_t)(r * columns + c) * width * width);
+      add_product(width, width, work->half, operator, product);
+      if (rows * columns > 1)
+        for (int32_t i = 0; i < width; ++i)
+          for (int32_t j = 0; j < width; ++j)
+            work->cell_tensor[((i * rows + r) * width + j) * columns + c] += work->product[width * i + j];
     }
 }
-
-/* Entry (a, b) of the components (r, c) of a cell's tensor is number
-   r * row_component + c * column_component + a * row_stride + b * column_stride. */
-typedef struct {
-  int64_t row_component, column_component, row_stride, column_stride;
-} layout;
 
 /* Where the entries of a cell's tensor go: see thccs_assemble_matrix. */
 typedef struct {
@@ -218,22 +220,24 @@ typedef struct {
   int32_t position_size;
 } target;
 
-static inline __attribute__((always_inline)) void add_rows(int32_t n, const int32_t *dofs, int32_t rows,
-                                                           int32_t columns, layout at, target into,
-                                                           const double *restrict tensor,
-                                                           double *restrict values)
+/* values += tensor (width, rows, width, columns), of which the first n functions are used. Inline, so that constants
+   among the arguments make loops of their own. */
+static inline __attribute__((always_inline)) void add_rows(int32_t n, int32_t width, const int32_t *dofs,
+                                                           int32_t rows, int32_t columns, target into,
+                                                           const double *restrict tensor, double *restrict values)
 {
   const uint8_t *narrow = into.positions;
   const uint16_t *wide = into.positions;
   for (int32_t a = 0; a < n; ++a, narrow += n, wide += n) {
     const int64_t begin = into.indptr[dofs[a]], length = into.indptr[dofs[a] + 1] - begin;
-    for (int32_t r = 0; r < rows; ++r)
-      for (int32_t c = 0; c < columns; ++c) {
-        const double *from = tensor + r * at.row_component + c * at.column_component + a * at.row_stride;
-        double *to = values + begin * rows * columns + r * length * columns + c;
-        for (int32_t b = 0; b < n; ++b)
-          to[columns * (into.position_size == 1 ? narrow[b] : wide[b])] += from[b * at.column_stride];
+    for (int32_t r = 0; r < rows; ++r, tensor += width * columns) {
+      double *row = values + (begin * rows + r * length) * columns;
+      for (int32_t b = 0; b < n; ++b) {
+        double *to = row + columns * (into.position_size == 1 ? narrow[b] : wide[b]);
+        for (int32_t c = 0; c < columns; ++c)
+          to[c] += tensor[b * columns + c];
       }
+    }
   }
 }
 
@@ -247,13 +251,9 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
   if (!memory)
     return -1;
   const double *tensor = batch->operators ? work.cell_tensor : work.piece_tensor;
-  const layout at = batch->operators
-                        ? (layout){(int64_t)columns * width * width, (int64_t)width * width, width, 1}
-                        : (layout){LOCAL * columns, 1, LOCAL * components, columns};
   for (int32_t i = 0; i < integral->num_cells; ++i) {
     const int32_t k = chosen(integral, i);
     const int32_t *dofs = batch->dofs + (int64_t)width * k;
-    const target into = {indptr, (const char *)positions + starts[k] * position_size, position_size};
     gather_coefficients(integral, width, dofs, work.cell_coefficients);
     if (batch->operators)
       memset(work.cell_tensor, 0, (int64_t)width * width * components * sizeof(double));
@@ -265,10 +265,16 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
     int32_t n = 0;
     while (n < width && dofs[n] >= 0)
       ++n;
-    if (components == 1 && position_size == 1) /* the usual case, with what it is told to the compiler */
-      add_rows(n, dofs, 1, 1, (layout){0, 0, width, 1}, (target){indptr, into.positions, 1}, tensor, values);
+    const target into = {indptr, (const char *)positions + starts[k] * position_size, position_size};
+    const target usual = {indptr, into.positions, 1};
+    if (position_size == 1 && components == 1)
+      add_rows(n, width, dofs, 1, 1, usual, tensor, values);
+    else if (position_size == 1 && columns == 2)
+      add_rows(n, width, dofs, rows, 2, usual, tensor, values);
+    else if (position_size == 1 && columns == 3)
+      add_rows(n, width, dofs, rows, 3, usual, tensor, values);
     else
-      add_rows(n, dofs, rows, columns, at, into, tensor, values);
+      add_rows(n, width, dofs, rows, columns, into, tensor, values);
   }
   free(memory);
   return 0;
@@ -292,6 +298,16 @@ void thccs_sparsity(int32_t num_dofs, const int32_t *cell_offsets, const int32_t
           indices[next[j]] = i;
         ++next[j];
       }
+}
+
+void thccs_blocked_indices(int32_t num_dofs, int32_t rows, int32_t columns, const int32_t *restrict indptr,
+                           const int32_t *restrict indices, int32_t *restrict blocked)
+{
+  for (int32_t i = 0; i < num_dofs; ++i)
+    for (int32_t r = 0; r < rows; ++r)
+      for (int32_t p = indptr[i]; p < indptr[i + 1]; ++p)
+        for (int32_t c = 0; c < columns; ++c)
+          *blocked++ = columns * indices[p] + c;
 }
 
 void thccs_positions(int32_t num_dofs, const int32_t *restrict cell_offsets, const int32_t *restrict cell_dofs,
@@ -376,4 +392,47 @@ void thccs_evaluate_patches(int64_t n, const int32_t *patches, const double *uv,
     evaluate_patches(n, patches, uv, 3, coefficients, 1, out);
   else
     evaluate_patches(n, patches, uv, size, coefficients, rows, out);
+}
+
+/* ---- Extraction ------------------------------------------------------------------------------------------------ */
+
+static int ascending(const void *a, const void *b)
+{
+  const int32_t x = *(const int32_t *)a, y = *(const int32_t *)b;
+  return (x > y) - (x < y);
+}
+
+void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
+                        int32_t *seen, int32_t *counts, const int32_t *offsets, int32_t *columns)
+{
+  for (int32_t c = 0; c < num_cells; ++c) {
+    int32_t count = 0;
+    for (int32_t k = indptr[cell_rows[c]]; k < indptr[cell_rows[c + 1]]; ++k)
+      if (seen[indices[k]] != c) {
+        seen[indices[k]] = c;
+        if (columns)
+          columns[offsets[c] + count] = indices[k];
+        ++count;
+      }
+    if (columns)
+      qsort(columns + offsets[c], count, sizeof *columns, ascending);
+    else
+      counts[c] = count;
+  }
+}
+
+void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
+                      const double *data, const int32_t *offsets, const int32_t *columns, const int32_t *width,
+                      const int64_t *starts, double *values)
+{
+  for (int32_t c = 0; c < num_cells; ++c)
+    for (int32_t r = cell_rows[c]; r < cell_rows[c + 1]; ++r) {
+      double *row = values + starts[c] + (int64_t)(r - cell_rows[c]) * width[c];
+      const int32_t *column = columns + offsets[c];
+      for (int32_t k = indptr[r]; k < indptr[r + 1]; ++k) {
+        while (*column != indices[k])
+          ++column;
+        row[column - (columns + offsets[c])] = data[k];
+      }
+    }
 }

@@ -43,6 +43,7 @@ from thccs_fem.subdivision import (
 __all__ = ["evaluate", "evaluate_patches"]
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.integer]
 
 ROWS = {0: 1, 1: 3, 2: 6}  # of the result for each highest order of derivatives
 APART = 4  # from this level on, faces that touch those of one irregular vertex touch none of another
@@ -61,10 +62,9 @@ def evaluate(
 
     At an irregular vertex (interior with other than four faces, on a smooth boundary with three or more, a corner with
     two or more) derivatives vanish or diverge.  Instead of the first ones there are two tangent vectors along the edges
-    of the face, whose cross product points along the normal: those of the closed-form masks on the first subdivision,
-    which are the derivatives where four faces meet.  Where two faces meet, the edges have opposite directions: there,
-    both tangents are turned into the face by 45 degrees.  At corners only boundary edges have a tangent, others get
-    NaN.  Second derivatives are NaN.
+    of the face, whose cross product points along the normal, from closed-form masks on the first subdivision; where
+    four faces meet these would be the derivatives.  Where there is no tangent plane (two faces inside, four or more on
+    a smooth boundary, corners), tangents other than those of the boundary curve are NaN.  So are second derivatives.
 
     Args:
         mesh: The control mesh.
@@ -144,7 +144,7 @@ class _Places:
         uv: Coordinates in these, shape (n, 2).
     """
 
-    points: npt.NDArray[np.intp]
+    points: Indices
     face: Ints
     uv: Floats
 
@@ -182,7 +182,7 @@ class _Ends:
     coefficients: list[Floats] = field(default_factory=list)
 
     @classmethod
-    def none(cls, corner: npt.NDArray[np.integer], gdim: int) -> Self:
+    def none(cls, corner: Indices, gdim: int) -> Self:
         """Return those of points that are still on the control mesh, in sub-quads where a corner is named."""
         m = corner.size
         return cls(
@@ -225,34 +225,33 @@ class _Ends:
 def _descend(mesh: ControlMesh, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None) -> _Ends:
     """Return where the points end; arguments as for `evaluate`."""
     control = control_level(mesh)
-    all_points = np.arange(np.size(faces))
-    corners = np.broadcast_to(-1 if corner is None else np.asarray(corner), all_points.shape)
+    left = np.arange(np.size(faces))
+    corners = np.broadcast_to(-1 if corner is None else np.asarray(corner), left.shape)
+    ends = _Ends.none(corners, mesh.gdim)
     if mesh.is_quad:
-        on = _Places(all_points, *in_quads(mesh, faces, uv, corners))
-        ends = _Ends.none(corners, mesh.gdim)
+        on = _Places(left, *in_quads(mesh, faces, uv, corners))
         on = ends.on_regular_faces(control, mesh.vertices, on)
-        # From what was given, since coordinates in the whole face are rounded where a corner is named.
-        uv = np.asarray(uv, dtype=np.float64)[on.points]
-        on = _Places(on.points, *in_sub_quads(mesh, on.face, uv, corners[on.points]))
+        left = on.points
+        # From what was given: coordinates in the whole face are rounded where a corner is named.
+        half_edge, local = in_sub_quads(mesh, on.face, np.asarray(uv, dtype=np.float64)[left], corners[left])
     else:
-        on = _Places(all_points, *in_sub_quads(mesh, faces, uv, corners))
-        ends = _Ends.none(corners, mesh.gdim)
-    if on.points.size:
-        # The faces of `on` are half-edges here, which is how the children of the whole mesh are numbered.
-        face = control.face[on.face]
-        child = on.face - control.offsets[face]
-        level, x, on = _next_level(control, mesh.vertices, ends, _Places(on.points, face, on.uv), child)
-        on = ends.at_vertices(level, x, on)
-        while (on := ends.on_regular_faces(level, x, on)).points.size:
-            if level.number >= APART:
-                x = _relative_to_vertices(level, x, ends, on)
-            child, uv = child_at(on.uv)
-            level, x, on = _next_level(level, x, ends, _Places(on.points, on.face, uv), child)
+        half_edge, local = in_sub_quads(mesh, faces, uv, corners)
+    if not left.size:
+        return ends
+    face = control.face[half_edge]
+    child = half_edge - control.offsets[face]
+    level, x, on = _next_level(control, mesh.vertices, ends, _Places(left, face, local), child)
+    on = ends.at_vertices(level, x, on)
+    while (on := ends.on_regular_faces(level, x, on)).points.size:
+        if level.number >= APART:
+            x = _relative_to_vertices(level, x, ends, on)
+        child, local = child_at(on.uv)
+        level, x, on = _next_level(level, x, ends, _Places(on.points, on.face, local), child)
     return ends
 
 
 def _next_level(level: Level, x: Floats, ends: _Ends, on: _Places, child: Ints) -> tuple[Level, Floats, _Places]:
-    """Subdivide the faces with points, which go to the given children; their coordinates are already those there."""
+    """Subdivide the faces with points and send these to the given children; their coordinates are those there."""
     step = subdivide(level, neighbourhood(level, on.marked(level)))
     ends.turns[on.points] += child
     ends.scale[on.points] *= 2.0
@@ -300,9 +299,8 @@ def _limit_positions(level: Level, x: Floats, half_edges: Ints) -> Floats:
 def _limit_tangents(level: Level, x: Floats, half_edges: Ints) -> Floats:
     """Return the limit tangents along half-edges and along the edges before them, at the vertices where they start.
 
-    They are left eigenvectors of the subdivision around the vertex.  With n faces, theta the angle between the edges of
-    a regular star (2 pi / n, or pi / n on a boundary) and lambda = (4 + a) / 16 the eigenvalue of its linear functions,
-    edges and face points weigh a cos and a sum of two cos; see Halstead, Kass, DeRose (1993).
+    The masks are left eigenvectors of the subdivision around a vertex (Halstead, Kass, DeRose 1993), as long as makes
+    the tangent 1 on the right eigenvector with edges cos(i theta): theta is 2 pi / n, or pi / n on the boundary.
 
     Returns:
         Shape (2, n, gdim).
@@ -353,50 +351,48 @@ def _ring(level: Level, half_edges: Ints) -> tuple[Ints, Ints, Ints]:
     return edges, opposite, place
 
 
-def _edge_weight(theta: Floats) -> Floats:
-    """Return a = 16 lambda - 4, the weight of edges relative to faces."""
-    return 1.0 + np.cos(theta) + np.cos(theta / 2) * np.sqrt(2.0 * (9.0 + np.cos(theta)))
-
-
-def _interior_mask(n: Ints, direction: Ints, i: Ints) -> tuple[Floats, Floats]:
-    """Return the weights of edges i and faces i for the tangent along an edge at interior vertices of n faces."""
+def _interior_mask(n: Ints, direction: Ints, i: Indices) -> tuple[Floats, Floats]:
+    """Return the weights of edges i and faces i for the tangent along an edge, at interior vertices of n faces."""
     theta = 2.0 * np.pi / n
     a = _edge_weight(theta)
     along = np.where(i < n, np.cos(theta * (i - direction)), 0.0)
     along_next = np.where(i < n, np.cos(theta * (i + 1 - direction)), 0.0)
-    # Of length 1 on the regular star of the eigenvectors: edges cos(i theta), faces 4 / a times the sum of theirs.
-    with np.errstate(invalid="ignore"):  # a = 0 for n = 2
-        length = n / 2.0 * (a + 8.0 * (1.0 + np.cos(theta)) / a)
-        edges, faces = a * along / length, (along + along_next) / length
-    # Two faces: the differences of the edges and of the faces both are eigenvectors.
-    edges = np.where(n == 2, along / 2.0, edges)
-    faces = np.where(n == 2, np.where(i < 2, 0.5 - i, 0.0), faces)
-    return edges, faces[:, :-1]
+    length = np.where(n == 2, np.nan, _squared_length(n, theta, a))  # a symmetric eigenvector is as large: no plane
+    return a * along / length, ((along + along_next) / length)[:, :-1]
 
 
-def _smooth_mask(n: Ints, direction: Ints, i: Ints) -> tuple[Floats, Floats]:
-    """Return the same on smooth boundaries: cos times the tangent along the rim and sin times that across.
+def _smooth_mask(n: Ints, direction: Ints, i: Indices) -> tuple[Floats, Floats]:
+    """Return the same on smooth boundaries: cos times the tangent along the rim plus sin times that across.
 
     Across, the weights inside are those of 2 n faces; the rim vertices get what makes it an eigenvector.
     """
     theta = np.pi / n
     a = _edge_weight(theta)
     inside = np.sin(theta * i)
-    rim = (np.sin(theta) * (a + 4.0) - 2.0 * (a + 2.0) / np.tan(theta / 2)) / a
-    ends = (i == 0) | (i == n)
-    length = n / 2.0 * (a + 8.0 * (1.0 + np.cos(theta)) / a)
-    across = np.where(ends, rim, np.where(i < n, a * inside, 0.0)) / length
+    rim = (np.sin(theta) * (a + 4.0) - 2.0 * (a + 2.0) / np.tan(theta / 2.0)) / a
+    length = _squared_length(n, theta, a)
+    across = np.where((i == 0) | (i == n), rim, np.where(i < n, a * inside, 0.0)) / length
     across_faces = np.where(i < n, inside + np.sin(theta * (i + 1)), 0.0) / length
     along = 0.5 * (i == 0) - 0.5 * (i == n)
-    cos, sin = np.cos(theta * direction), np.sin(theta * direction)
-    return cos * along + sin * across, (sin * across_faces)[:, :-1]
-
-
-def _corner_mask(n: Ints, direction: Ints, i: Ints) -> tuple[Floats, Floats]:
-    """Return the same at corners: boundary edges are curves that begin there, others have no tangent."""
     on_rim = (direction == 0) | (direction == n)
-    edges = np.where(on_rim, 1.0 * (i == direction), np.nan)
-    return edges, np.zeros((len(n), i.size - 1))
+    sin = np.where(on_rim, 0.0, np.where(n <= 3, np.sin(theta * direction), np.nan))
+    return np.cos(theta * direction) * along + sin * across, (sin * across_faces)[:, :-1]
+
+
+def _corner_mask(n: Ints, direction: Ints, i: Indices) -> tuple[Floats, Floats]:
+    """Return the same at corners, where the boundary curves begin along their first edges."""
+    on_rim = (direction == 0) | (direction == n)
+    return np.where(on_rim, 1.0 * (i == direction), np.nan), np.zeros((len(n), i.size - 1))
+
+
+def _edge_weight(theta: Floats) -> Floats:
+    """Return a = 16 lambda - 4, the weight of edges relative to faces."""
+    return 1.0 + np.cos(theta) + np.cos(theta / 2.0) * np.sqrt(2.0 * (9.0 + np.cos(theta)))
+
+
+def _squared_length(n: Ints, theta: Floats, a: Floats) -> Floats:
+    """Return the left eigenvector (a cos, cos + cos) times the right one (cos, (cos + cos) 4 / a), around n faces."""
+    return n / 2.0 * (a + 8.0 * (1.0 + np.cos(theta)) / a)
 
 
 def _turn(out: Floats, turns: Ints, scale: Floats) -> None:

@@ -1,8 +1,8 @@
 """Pictures by PyVista: the limit surface coloured by a function, with the sides of the elements drawn on it.
 
-Every bicubic piece is sampled here on a grid of n x n facets, at its exact points, with the exact normals and values.  The
-error of linear interpolation, at most max |second difference of Bernstein coefficients| * 0.75 / n^2, gives n: no facet
-strays from the surface, and so no gap between pieces opens, by as much as one could see.
+Every bicubic piece is sampled here on a grid of n x n facets, with exact points, normals and values.  Linear
+interpolation on n segments errs by at most 0.75 / n^2 times the largest second difference of the Bernstein coefficients.
+This gives n: no facet strays from the surface, and no gap opens between pieces, by as much as one could see.
 """
 
 from __future__ import annotations
@@ -28,20 +28,23 @@ if TYPE_CHECKING:  # imported where it is needed: it takes its time
 
 __all__ = ["mesh_lines", "plot", "surface"]
 
-GAP = 1 / 15000  # of the diameter of the surface: a tenth of a pixel of a picture
-SHADE = 1 / 250  # of the range of values: as many colours are on the bar
+GAP = 1 / 15000  # error of points, of the surface's diameter: a tenth of a pixel of a picture
+SHADE = 1 / 500  # error of values, of their range: half a colour of the bar
+FACET = 1 / 100  # sides of facets, of the surface's diameter: else the eye finds the kinks in the colours
 MOST_SEGMENTS = 64  # on a side of a piece
 MOST_FACETS = 2_000_000  # in a picture, which takes some seconds
 
-# Picture
-VIEW, UP = np.array([0.55, -0.95, 0.6]), np.array([0.0, 0.0, 1.0])  # from where surfaces in space are seen
+TOWARDS = np.array([0.55, -0.95, 0.8])  # the viewer of a surface in space
+SHOWN = "shown"  # name of the values that colours stand for
+LIGHT: dict[str, Any] = {"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "specular_power": 20.0}
 MARGIN = 1.06  # what is seen, in terms of the surface
-BAR = 0.14  # part of the picture's width for the scalar bar
-PLAIN = "#d5dbe3"  # surface without a function
-LINE = "#20242c"
+BAR = 0.14  # part of the picture's width that is left to the scalar bar
+PLAIN = "#d5dbe3"  # colour of a surface without a function
+INK = "#20242c"  # colour of letters and of lines on it
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue
+ROUNDING = 1e-9  # values that differ less, of the largest, are one
 
-# Corners of a piece; side k runs from corner k to corner k + 1.
-CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # side k of a piece: corner k to corner k + 1
 
 Floats = npt.NDArray[np.float64]
 
@@ -60,10 +63,10 @@ def plot(
 
     Args:
         uh: A function (of one with vector values the magnitude is drawn), or a space.
-        filename: PNG file to write, also on machines without a display; None opens a window.
-        camera: Camera position as PyVista takes it: "xy", "iso", a direction, or (position, focal point, up). By default
-            planar surfaces are seen from above, others obliquely with z upwards.
-        clim: Values at the ends of the colour map; by default those of the function.
+        filename: PNG file to write, also on a machine without a display; None opens a window.
+        camera: Camera position as PyVista takes it: "xy", "iso", ..., a direction towards the viewer, or (position,
+            focal point, up). By default planar surfaces are seen from above, others obliquely with z upwards.
+        clim: Values at the ends of the colour map; by default the least and the largest there are.
         cmap: Colour map as PyVista takes it.
         lines: Whether to draw the sides of the elements.
         window_size: Width and height in pixels.
@@ -71,35 +74,40 @@ def plot(
     Raises:
         TypeError: If `uh` is neither function nor space.
         ValueError: If the file is not called .png, or the function has values that are not finite.
-        OSError: If the file cannot be written, or there is neither a display nor OpenGL to draw without one.
+        OSError: If the file cannot be written, or there is nothing to draw on.
     """
     import pyvista
 
     path = None if filename is None else _checked(Path(filename))
-    drawn = surface(uh)
-    with pyvista.vtk_verbosity("off"):  # it would report on each kind of display that it doesn't find
+    facets, sides = surface(uh), mesh_lines(uh) if lines else None
+    with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
         plotter = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
     try:
-        _check_display(plotter)
+        _check_there_is_something_to_draw_on(plotter)
         plotter.set_background("white")
-        plotter.enable_anti_aliasing("ssaa")
-        _add_surface(plotter, drawn, uh, clim, cmap)
-        if lines:
-            _add_lines(plotter, uh)
-        _set_camera(plotter, drawn.points, camera, bar=isinstance(uh, Function))
+        plotter.renderer.enable_anti_aliasing("ssaa")
+        if isinstance(uh, Function):
+            _draw_function(plotter, uh, facets, sides, clim, cmap)
+        else:
+            _draw(plotter, facets, sides, {"color": PLAIN}, {"color": INK})
+        _set_camera(plotter, facets.points, camera, BAR if isinstance(uh, Function) else 0.0)
         if path is None:
             plotter.show()
         else:
             plotter.screenshot(path)
     finally:
-        plotter.close()
+        if path is not None:  # else show() has closed it, unless it lives on in a notebook
+            plotter.close()
 
 
 def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
-    """Return the limit surface as quadrilateral facets, for pictures of one's own.
+    """Return the limit surface as facets, for pictures of one's own.
 
-    Point data are the normals and, by its name, the function; cell data those of `thccs_fem.vtk.cell_numbers`. Pieces
+    Point data are the normals and, by its name, the function; cell data are the numbers of `vtk.cell_numbers`. Pieces
     share no points.
+
+    Args:
+        uh: The function, or a space.
 
     Raises:
         TypeError: If `uh` is neither function nor space.
@@ -107,45 +115,297 @@ def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
     """
     import pyvista
 
-    cells, values = _cells(uh), _values(uh)
+    cells, values = _cells_and_values(uh)
     points, normals, sampled, facets, piece = [], [], [], [], []
-    for n, chosen, first in _groups(_segments(cells, values)):
+    num_points = 0
+    for n, pieces in _by_segments(cells, values):
         t = np.linspace(0.0, 1.0, n + 1)
         along, slopes = element.bspline_values(t), element.bspline_slopes(t)
-        at, local = np.kron(along, along), cells.piece_points[chosen]
-        points.append(at @ local)
-        normals.append(_normals(np.kron(along, slopes) @ local, np.kron(slopes, along) @ local))
-        sampled.append(at @ values[chosen])
-        facets.append(first + _numbers(chosen.size, _facets(n), (n + 1) ** 2))
-        piece.append(np.repeat(chosen, n * n))
-    mesh = pyvista.PolyData.from_regular_faces(in_space(_joined(points)), np.concatenate(facets))
-    mesh.point_data["Normals"] = _joined(normals)
-    mesh.point_data.active_normals_name = "Normals"
-    if isinstance(uh, Function):
-        mesh.point_data[uh.name] = _joined(sampled) if uh.function_space.value_shape else _joined(sampled)[:, 0]
+        local = cells.piece_points[pieces]
+        points.append(_on_grid(along, along, local))
+        normals.append(_normals(_on_grid(slopes, along, local), _on_grid(along, slopes, local)))
+        sampled.append(_on_grid(along, along, values[pieces]))
+        facets.append(num_points + _grid_facets(pieces.size, n))
+        piece.append(np.repeat(pieces, n * n))
+        num_points += len(points[-1])
+    mesh = pyvista.PolyData.from_regular_faces(in_space(np.concatenate(points)), np.concatenate(facets))
+    mesh.point_data.active_normals = np.concatenate(normals)
+    _add_values(mesh, uh, np.concatenate(sampled))
     for name, numbers in cell_numbers(cells).items():
         mesh.cell_data[name] = numbers[np.concatenate(piece)]
     return mesh
 
 
 def mesh_lines(uh: Function | FunctionSpace) -> pyvista.PolyData:
-    """Return the sides of the elements as lines on the limit surface, each side of each element for itself.
+    """Return the sides of the elements as lines along the facets of `surface`; elements share no lines.
 
-    The lines run along the facets of `surface`.
+    Args:
+        uh: The function, or a space.
 
     Raises:
         TypeError, ValueError: As for `surface`.
     """
     import pyvista
 
-    cells, values = _cells(uh), _values(uh)
+    cells, values = _cells_and_values(uh)
     outer = _on_cell_boundary(cells)
-    points, lines, first = [np.zeros((0, cells.points.shape[1]))], [], 0
-    for n, chosen, _ in _groups(_segments(cells, values)):
-        t = np.arange(n + 1)
-        sides = np.stack([t, n + (n + 1) * t, (n + 1) * n + t, (n + 1) * t])
-        along = element.bspline_values(t / n)
-        piece, side = np.nonzero(outer[chosen])
-        on_sides = np.kron(along, along)[sides]
-        points.append(np.einsum("psc,psk->pck", on_sides))
-    return pyvista.PolyData()
+    points, sampled, lines = [], [], []
+    num_points = 0
+    for n, pieces in _by_segments(cells, values):
+        piece, side = np.nonzero(outer[pieces])
+        on_sides = _on_sides(n)[side]
+        points.append((on_sides @ cells.piece_points[pieces[piece]]).reshape(-1, cells.points.shape[1]))
+        sampled.append((on_sides @ values[pieces[piece]]).reshape(-1, values.shape[2]))
+        number = num_points + np.arange(len(points[-1])).reshape(-1, n + 1)
+        lines.append(np.insert(number, 0, n + 1, axis=1).ravel())
+        num_points += number.size
+    mesh = pyvista.PolyData(in_space(np.concatenate(points)), lines=np.concatenate(lines))
+    _add_values(mesh, uh, np.concatenate(sampled))
+    return mesh
+
+
+def _add_values(mesh: pyvista.PolyData, uh: Function | FunctionSpace, values: Floats) -> None:
+    if isinstance(uh, Function):
+        mesh.point_data[uh.name] = values if uh.function_space.value_shape else values[:, 0]
+
+
+def _cells_and_values(uh: Function | FunctionSpace) -> tuple[Cells, Floats]:
+    """Return cells and local B-spline coefficients of the values, shape (num_pieces, 16, k); zero for a space."""
+    if isinstance(uh, FunctionSpace):
+        return uh.cells, np.zeros((uh.cells.num_pieces, element.NUM_FUNCTIONS, 1))
+    if not isinstance(uh, Function):
+        raise TypeError(f"expected a Function or a FunctionSpace, got {type(uh).__name__}")
+    strange = np.count_nonzero(~np.isfinite(uh.x.array))
+    if strange:
+        raise ValueError(
+            f"{strange} of the {uh.x.array.size} coefficients of {uh.name!r} are infinite or not a number: see how "
+            f"they were computed (did the solver diverge?)"
+        )
+    return uh.function_space.cells, uh.local_coefficients()
+
+
+def _by_segments(cells: Cells, values: Floats) -> Iterator[tuple[int, Ints]]:
+    """Yield numbers of segments along a side and the pieces that are to have so many."""
+    points = cells.piece_points
+    diameter, value_range = (np.linalg.norm(np.ptp(x, axis=(0, 1))) for x in (points, values))
+    seen = max(SHADE * value_range, ROUNDING * np.abs(values).max(), np.finfo(float).tiny)
+    squared = 0.75 * np.maximum(_difference(points, 2) / (GAP * diameter), _difference(values, 2) / seen)
+    wanted = np.maximum(np.sqrt(squared), 3.0 * _difference(points, 1) / (FACET * diameter))
+    segments = 2 ** np.ceil(np.log2(np.clip(wanted, 1, MOST_SEGMENTS))).astype(np.int64)
+    while np.sum(segments**2) > MOST_FACETS and segments.max() > 1:
+        segments = np.maximum(segments // 2, 1)
+    for n in np.unique(segments):
+        yield int(n), np.flatnonzero(segments == n).astype(np.int32)
+
+
+def _difference(local: Floats, order: int) -> Floats:
+    """Return the largest difference of that order of Bernstein coefficients along u or v, shape (num_pieces,)."""
+    bernstein = (element.TO_BERNSTEIN @ local).reshape(-1, 4, 4, local.shape[2])
+    differences = [np.linalg.norm(np.diff(bernstein, order, axis=axis), axis=-1) for axis in (1, 2)]
+    return np.maximum(*(d.max(axis=(1, 2)) for d in differences))
+
+
+def _on_grid(along_u: Floats, along_v: Floats, local: Floats) -> Floats:
+    """Return values on the grids of pieces, u fastest, shape (num_pieces (n + 1)^2, k), from B-splines along u and v."""
+    return (np.kron(along_v, along_u) @ local).reshape(-1, local.shape[2])
+
+
+def _normals(du: Floats, dv: Floats) -> Floats:
+    """Return the unit normals, shape (n, 3), from derivatives; zero where these are parallel."""
+    normals = np.cross(in_space(du), in_space(dv))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return normals / np.where(length > 0.0, length, 1.0)
+
+
+def _grid_facets(num_pieces: int, n: int) -> npt.NDArray[np.int_]:
+    """Return the corners of the facets on the grids of all pieces, shape (num_pieces n^2, 4)."""
+    first = np.add.outer(np.arange(num_pieces) * (n + 1) ** 2, np.add.outer(np.arange(n) * (n + 1), np.arange(n)))
+    return np.add.outer(first, [0, 1, n + 2, n + 1]).reshape(-1, 4)
+
+
+def _on_sides(n: int) -> Floats:
+    """Return the B-splines on the sides of a piece, from corner to corner, shape (4, n + 1, 16)."""
+    t = np.linspace(0.0, 1.0, n + 1)[:, None]
+    uv = (1.0 - t) * CORNERS[:, None] + t * np.roll(CORNERS, -1, axis=0)[:, None]
+    values = element.bspline_values(uv)
+    return (values[:, :, 1, :, None] * values[:, :, 0, None, :]).reshape(4, n + 1, element.NUM_FUNCTIONS)
+
+
+def _on_cell_boundary(cells: Cells) -> Bools:
+    """Return which sides of the pieces are on the sides of their cells, shape (num_pieces, 4)."""
+    corners = cells.piece_origin[:, None] + CORNERS @ cells.piece_axes.transpose(0, 2, 1)
+    on_edge = (corners == 0.0) | (corners == 1.0)  # dyadic numbers: exact
+    return (on_edge & (corners == np.roll(corners, -1, axis=1))).any(axis=2)
+
+
+def _checked(path: Path) -> Path:
+    """Return the path of a picture if it can be one."""
+    if path.suffix != ".png":
+        raise ValueError(f"the picture is to be called {str(path)!r}, but the name must end in .png")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"there is no directory {str(path.parent)!r} for {path.name!r}; make it first")
+    return path
+
+
+def _check_there_is_something_to_draw_on(plotter: pyvista.Plotter) -> None:
+    """Raise OSError where VTK would crash or wait for ever."""
+    if plotter.off_screen:
+        window: Any = plotter.render_window
+        window.Initialize()
+        if not window.IsCurrent():
+            raise OSError(
+                "VTK found no OpenGL to draw with: install Mesa's EGL or OSMesa (on Debian and Ubuntu: apt install "
+                "libegl1 libgl1-mesa-dri), or run under xvfb-run"
+            )
+    elif sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise OSError(
+            "there is no display to open a window on (DISPLAY is not set): give a filename to write a picture"
+        )
+
+
+def _draw_function(
+    plotter: pyvista.Plotter,
+    uh: Function,
+    facets: pyvista.PolyData,
+    sides: pyvista.PolyData | None,
+    clim: Sequence[float] | None,
+    cmap: Any,
+) -> None:
+    """Draw a surface coloured by a function, and lines that stand out on these colours."""
+    import pyvista
+
+    value = facets.point_data[SHOWN] = _magnitude(facets.point_data[uh.name])
+    low, high = _range(value) if clim is None else _checked_range(clim)
+    table = pyvista.LookupTable(cmap, scalar_range=(low, high))
+    line_colours = {}
+    if sides is not None:
+        on_sides = table(_magnitude(sides.point_data[uh.name]))
+        line_colours = {"scalars": _standing_out(on_sides), "rgb": True}
+    colours = {"scalars": SHOWN, "cmap": table, "show_scalar_bar": False}
+    actor = _draw(plotter, facets, sides, colours, line_colours)
+    _add_bar(plotter, actor.mapper, f"magnitude of {uh.name}" if uh.function_space.value_shape else uh.name, low, high)
+
+
+def _draw(
+    plotter: pyvista.Plotter,
+    facets: pyvista.PolyData,
+    sides: pyvista.PolyData | None,
+    colours: dict[str, Any],
+    line_colours: dict[str, Any],
+) -> pyvista.Actor:
+    """Draw a surface, shaded unless it is flat, and lines on it; return the surface drawn."""
+    # Neighbours with different n leave holes of a pixel's size. Lines in the colours of the surface close them.
+    seams = facets.extract_feature_edges(
+        boundary_edges=True, non_manifold_edges=False, feature_edges=False, manifold_edges=False
+    )
+    actors = [
+        plotter.add_mesh(drawn, lighting=not _is_flat(facets.points), line_width=1.0, **LIGHT, **colours)
+        for drawn in (facets, seams)
+    ]
+    for actor in actors:
+        actor.prop.interpolation = "Phong"  # with the normals given
+        actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
+    # What is at one place is drawn in this order: lines, seams, facets.
+    actors[0].mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 4.0)
+    actors[1].mapper.SetRelativeCoincidentTopologyLineOffsetParameters(1.0, 2.0)
+    if sides is not None:
+        plotter.add_mesh(sides, lighting=False, line_width=plotter.window_size[1] / 600.0, **line_colours)
+    return actors[0]
+
+
+def _standing_out(colours: Floats) -> npt.NDArray[np.uint8]:
+    """Return colours of lines that can be seen on those given, shape (n, 3): darker, or lighter than what is dark."""
+    rgb = colours[:, :3]
+    dark = (rgb @ LUMINANCE)[:, None] < 0.2
+    return (255 * np.where(dark, 0.7 * rgb + 0.3, 0.25 * rgb)).astype(np.uint8)
+
+
+def _magnitude(values: Floats) -> Floats:
+    return np.asarray(values if values.ndim == 1 else np.linalg.norm(values, axis=1))
+
+
+def _range(values: Floats) -> tuple[float, float]:
+    """Return the least and the largest value, or an interval around them where these are the same to rounding."""
+    low, high = float(values.min()), float(values.max())
+    largest = max(abs(low), abs(high))
+    if high - low > ROUNDING * largest:
+        return low, high
+    return low - (largest or 1.0) / 2.0, high + (largest or 1.0) / 2.0
+
+
+def _checked_range(clim: Sequence[float]) -> tuple[float, float]:
+    low, high = clim
+    if not -np.inf < low < high < np.inf:
+        raise ValueError(f"clim is {clim!r}; expected two finite numbers, the lower one first")
+    return low, high
+
+
+def _add_bar(plotter: pyvista.Plotter, mapper: pyvista.DataSetMapper, title: str, low: float, high: float) -> None:
+    """Add a scalar bar with round numbers on the right."""
+    import pyvista
+
+    width, height = plotter.window_size
+    left, bottom, tall = 1.0 - BAR + 0.01, 0.15, 0.7
+    letters = min(height / 32.0, BAR * width / (0.6 * max(len(title), 1)))  # a letter is about 0.6 as wide as high
+    plotter.add_text(
+        title, position=(left, bottom + tall + 0.02), viewport=True, font_size=int(letters / 2.0), color=INK
+    )
+    ticks, form = _ticks(low, high)
+    bar = plotter.scalar_bars.add_scalar_bar(
+        mapper=mapper,
+        vertical=True,
+        color=INK,
+        fmt=form,
+        position_x=left,
+        position_y=bottom,
+        width=BAR - 0.02,
+        height=tall,
+        label_font_size=height // 38,
+    )
+    bar.SetBarRatio(0.25)
+    bar.SetTextPad(height // 200)
+    bar.SetUseCustomLabels(True)
+    bar.SetCustomLabels(pyvista.convert_array(ticks))
+
+
+def _ticks(low: float, high: float) -> tuple[Floats, str]:
+    """Return some four to eight round numbers in an interval, and a format that tells them apart."""
+    power = 10.0 ** np.floor(np.log10((high - low) / 4.0))
+    step = power * max(k for k in (1.0, 2.0, 5.0) if 4.0 * k * power <= (high - low) * (1.0 + 1e-9))
+    ticks = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1.0) + 0.0  # no -0
+    digits = np.floor(np.log10(np.abs(ticks).max())) - np.floor(np.log10(power)) + 1.0
+    return ticks, f"%.{int(digits)}g"
+
+
+def _set_camera(plotter: pyvista.Plotter, points: Floats, camera: Any, bar: float) -> None:
+    """Look as the user wants, or so that the surface fills what the bar leaves of the picture."""
+    view = plotter.camera
+    if camera is not None:
+        plotter.camera_position = camera
+        if not isinstance(camera, str) and np.ndim(camera) != 1:
+            return
+        towards, up = np.array(view.position) - view.focal_point, np.array(view.up)
+    elif _is_flat(points):
+        towards, up = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    else:
+        towards, up = TOWARDS, np.array([0.0, 0.0, 1.0])
+    towards = towards / np.linalg.norm(towards)
+    right = np.cross(up, towards)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(towards, right), towards])
+    seen = points @ axes.T
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    size = high - low
+    aspect = plotter.window_size[0] / plotter.window_size[1]
+    height = MARGIN * max(size[1], size[0] / (aspect * (1.0 - bar)))
+    focus = (low + high) / 2.0 + np.array([bar / 2.0 * aspect * height, 0.0, 0.0])
+    view.parallel_projection = True
+    view.parallel_scale = height / 2.0
+    view.focal_point = focus @ axes
+    view.position = (focus + np.array([0.0, 0.0, 2.0 * np.linalg.norm(size)])) @ axes
+    view.up = axes[1]
+    plotter.reset_camera_clipping_range()
+
+
+def _is_flat(points: Floats) -> bool:
+    return not points[:, 2].any()

@@ -15,6 +15,7 @@ vertex.  Rows of S for such vertices are placeholders (they sum to one); no one 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -37,6 +38,7 @@ __all__ = [
     "in_sub_quads",
     "neighbourhood",
     "subdivide",
+    "subdivided",
 ]
 
 INFINITE_SHARPNESS = 10.0  # at and above this a crease or corner never becomes smooth
@@ -241,6 +243,44 @@ def _rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:
     distance[start[irregular[end]]] = 1
     distance[irregular] = 0
     return distance
+
+
+def subdivided(mesh: ControlMesh, times: int = 1) -> ControlMesh:
+    """Return the control mesh after some Catmull-Clark steps: all quads, with the same limit surface and tags.
+
+    The child at half-edge h of a mesh (corner h - face_offsets[f] of face f) is face h of the next one; old vertices keep
+    their numbers.
+
+    Args:
+        mesh: The control mesh.
+        times: Number of steps.
+
+    Raises:
+        ValueError: If `times` is negative.
+        NotImplementedError: If the mesh has creases inside or semi-sharp corners.
+    """
+    if times < 0:
+        raise ValueError(f"times is {times}; a mesh can be subdivided 0 or more times")
+    for _ in range(times):
+        level = control_level(mesh)
+        step = subdivide(level, np.ones(level.num_faces, dtype=bool))
+        mesh = ControlMesh(
+            step.matrix @ mesh.vertices,
+            step.fine.quads,
+            face_tags=np.repeat(mesh.face_tags, mesh.face_sizes),
+            edge_tags=_on_halves(mesh.edge_tags, level, step),
+            creases=_on_halves(mesh.creases, level, step),
+            corners=mesh.corners,
+            comm=mesh.comm,
+        )
+    return mesh
+
+
+def _on_halves[T](values: Mapping[tuple[int, int], T], level: Level, step: Step) -> dict[tuple[int, int], T]:
+    """Return values of edges as values of their two halves."""
+    ends = np.sort(np.stack([level.vertices[step.edges], level.vertices[level.following[step.edges]]], axis=1), axis=1)
+    point = {(int(a), int(b)): step.old.size + k for k, (a, b) in enumerate(ends)} if values else {}
+    return {(end, point[edge]): value for edge, value in values.items() for end in edge}
 
 
 @dataclass(frozen=True, eq=False)

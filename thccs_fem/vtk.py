@@ -1,8 +1,8 @@
 """Results as VTK files: one Bezier quadrilateral (cell type 77) for each bicubic piece, which is the exact surface.
 
-A Bezier quadrilateral of 16 points is bicubic: its points are the Bernstein coefficients of the piece, and VTK interpolates
-data given at them in the same Bernstein basis.  So surface and functions are the computed ones everywhere, and whoever draws
-them chooses how finely.
+A Bezier quadrilateral of 16 points is bicubic: its points are the Bernstein coefficients of the piece, and VTK
+interpolates data given at them in the same Bernstein basis.  So surface and functions are the computed ones everywhere,
+and whoever draws them chooses how finely.
 
 Pieces share no points.  Neighbours agree along their common side, but in different polynomials where one is finer.
 """
@@ -67,7 +67,7 @@ def write_vtu(
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         draft = Path(folder, path.name)
         _save(grid, draft)
-        os.replace(draft, path)
+        draft.replace(path)
 
 
 def _save(grid: pyvista.UnstructuredGrid, path: Path) -> None:
@@ -80,7 +80,9 @@ def _save(grid: pyvista.UnstructuredGrid, path: Path) -> None:
     writer.SetInputData(grid)
     if not writer.Write():
         reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
-        raise OSError(f"VTK could not write {str(path)!r} ({reason}): see that there is space and that you may write there")
+        raise OSError(
+            f"VTK could not write {str(path)!r} ({reason}): see that there is space and that you may write there"
+        )
 
 
 def bezier_grid(
@@ -88,8 +90,8 @@ def bezier_grid(
 ) -> pyvista.UnstructuredGrid:
     """Return functions, or only the elements of a space, as Bezier quadrilaterals, one for each bicubic piece.
 
-    Point data are the Bernstein coefficients of the functions, vectors with two components filled up to three. Cell data
-    are those given and the numbers of `cell_numbers`.
+    Point data are the Bernstein coefficients of the functions, vectors with two components filled up to three. Cell
+    data are those given and the numbers of `cell_numbers`.
 
     Args:
         uh: A function, several on the same elements, or a space.
@@ -102,8 +104,8 @@ def bezier_grid(
 
     cells, functions = _cells_and_functions(uh)
     num_points = element.NUM_FUNCTIONS * cells.num_pieces
-    numbers = np.arange(num_points).reshape(-1, element.NUM_FUNCTIONS)
-    connectivity = np.insert(numbers, 0, element.NUM_FUNCTIONS, axis=1)
+    quads = np.arange(num_points).reshape(-1, element.NUM_FUNCTIONS)
+    connectivity = np.insert(quads, 0, element.NUM_FUNCTIONS, axis=1)
     types = np.full(cells.num_pieces, pyvista.CellType.BEZIER_QUADRILATERAL, dtype=np.uint8)
     grid = pyvista.UnstructuredGrid(connectivity.ravel(), types, in_space(_bernstein(cells.piece_points)))
     for f in functions:
@@ -139,13 +141,15 @@ def _cells_and_functions(uh: object) -> tuple[Cells, list[Function]]:
     functions = [uh] if isinstance(uh, Function) else list(uh) if isinstance(uh, Iterable) else []
     strange = next((f for f in functions if not isinstance(f, Function)), None if functions else uh)
     if strange is not None:
-        raise TypeError(f"expected a Function, a sequence of Functions or a FunctionSpace, got {type(strange).__name__}")
+        raise TypeError(
+            f"expected a Function, a sequence of Functions or a FunctionSpace, got {type(strange).__name__}"
+        )
     first = functions[0].function_space
     for f in functions[1:]:
         if not _same_pieces(f.function_space.hierarchy, first.hierarchy):
             raise ValueError(
-                f"the elements of {f.name!r} ({f.function_space!r}) are not those of {functions[0].name!r} ({first!r}): carry "
-                f"the coarser function over with adapt.transfer, or write them to two files"
+                f"the elements of {f.name!r} ({f.function_space!r}) are not those of {functions[0].name!r} ({first!r}): "
+                f"carry the coarser function over with adapt.transfer, or write two files"
             )
     names = [f.name for f in functions]
     if len(set(names)) < len(names):

@@ -9,6 +9,7 @@ from thccs_fem.fem.bcs import DirichletBC, boundary_dofs, dirichletbc, locate_do
 from thccs_fem.fem.expression import Expression
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.project import project
 from thccs_fem.fem.space import FunctionSpace, functionspace
 
 __all__ = [
@@ -27,5 +28,6 @@ __all__ = [
     "form",
     "functionspace",
     "locate_dofs_geometrical",
+    "project",
     "region_dofs",
 ]

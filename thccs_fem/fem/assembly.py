@@ -27,6 +27,7 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
 
 LARGEST_INT = np.iinfo(np.int32).max
+LONGEST_ROW = 2**16  # positions in a row are kept as uint16 or uint8
 
 
 def assemble_scalar(form: Form, /) -> float:
@@ -75,10 +76,11 @@ def assemble_matrix(A: sp.csr_array, form: Form, /) -> sp.csr_array: ...
 
 
 def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /) -> sp.csr_array:
-    """Assemble a matrix: ``A = assemble_matrix(form)``, and with new values ``assemble_matrix(A, form)``.
+    """Assemble a matrix, or give an assembled one new values.
 
-    All pairs of dofs that share a cell have an entry, zero or not; column indices are sorted, and int32. Refilling writes
-    ``A.data`` in place, so that who shares its memory sees the new values.
+    ``A = assemble_matrix(form)`` has an entry for each pair of dofs that share a cell, zero or not; its column indices
+    are sorted, and int32. ``assemble_matrix(A, form)`` writes ``A.data`` in place: who shares its memory sees the new
+    values.
 
     Returns:
         Shape (num_dofs of the test space, num_dofs of the trial space).
@@ -301,13 +303,11 @@ class _Pattern:
                 f"the matrix would have {nnz} entries, more than the {LARGEST_INT} that 32-bit indices can count: use "
                 f"fewer dofs or components, or assemble the components one by one"
             )
-        if rows == columns == 1:
-            return self.indptr.copy(), self.indices.copy()
-        lengths = np.repeat(np.diff(self.indptr) * columns, rows)
-        indptr = np.concatenate([[0], np.cumsum(lengths)])
-        scalar_row = (columns * self.indices[:, None] + np.arange(columns, dtype=np.int32)).ravel()
-        source = np.arange(nnz) + np.repeat(np.repeat(self.indptr[:-1] * columns, rows) - indptr[:-1], lengths)
-        return indptr.astype(np.int32), scalar_row[source]
+        indptr = np.concatenate([[0], np.cumsum(np.repeat(np.diff(self.indptr) * columns, rows))]).astype(np.int32)
+        indices = np.zeros(nnz, dtype=np.int32)
+        scalar = _pointer(self.indptr), _pointer(self.indices)
+        library().lib.thccs_blocked_indices(self.indptr.size - 1, rows, columns, *scalar, _pointer(indices))
+        return indptr, indices
 
 
 _patterns: WeakKeyDictionary[Cells, _Pattern] = WeakKeyDictionary()
@@ -331,8 +331,9 @@ def _new_pattern(cells: Cells) -> _Pattern:
     lengths = np.zeros(num_dofs, dtype=np.int32)
     scratch = np.full(num_dofs, -1, dtype=np.int32)
     lib.thccs_sparsity(num_dofs, *incidence, _pointer(scratch), _pointer(lengths), library().ffi.NULL)
-    if lengths.max() > 2**16:
-        raise ValueError(f"a dof shares cells with {lengths.max()} others, more than {2**16}: split the pole it is at")
+    if lengths.max() > LONGEST_ROW:
+        others = f"{lengths.max()} others, more than {LONGEST_ROW}"
+        raise ValueError(f"a dof shares cells with {others}: split the pole that it is at")
     indptr = _offsets(lengths, "entries of the matrix").astype(np.int32)
     indices = np.zeros(indptr[-1], dtype=np.int32)
     scratch[:] = -1

@@ -12,11 +12,6 @@ from types import ModuleType
 from typing import Any
 
 import scipy.sparse as sp
-from ufl.algorithms import apply_algebra_lowering, apply_derivatives
-from ufl.algorithms.estimate_degrees import SumDegreeEstimator
-from ufl.corealg.map_dag import map_expr_dags
-from ufl.corealg.traversal import traverse_unique_terminals
-from ufl.domain import extract_domains
 
 import ufl
 from thccs_fem import element, jit
@@ -25,6 +20,11 @@ from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import FunctionSpace, functionspace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh, Domain
+from ufl.algorithms import apply_algebra_lowering, apply_derivatives
+from ufl.algorithms.estimate_degrees import SumDegreeEstimator
+from ufl.corealg.map_dag import map_expr_dags
+from ufl.corealg.traversal import traverse_unique_terminals
+from ufl.domain import extract_domains
 
 __all__ = ["Form", "Integral", "form"]
 
@@ -100,9 +100,10 @@ def form(
 ) -> Form:
     """Compile a UFL form, or load it from the cache.
 
-    The quadrature of an integral is Gauss' rule for the degree in its metadata, ``dx(metadata={"quadrature_degree": 5})``;
-    else `quadrature_degree`; else the degree of the integrand on a parallelogram, where arguments and functions count 3
-    and the geometry 0, but at least 7 (4 x 4 points) and at most 11 (6 x 6).
+    The quadrature of an integral is Gauss' rule for the degree in its metadata, as in
+    ``dx(metadata={"quadrature_degree": 5})``; else for `quadrature_degree`; else for the degree of the integrand on a
+    parallelogram, where arguments and functions count 3 and the geometry 0, but at least 7 (4 x 4 points) and at most
+    11 (6 x 6).
 
     Args:
         ufl_form: A sum of integrals over ``dx``, or ``dx(tag)`` with a face tag of the mesh, or ``dx((tag, tag))``. A
@@ -112,8 +113,8 @@ def form(
 
     Raises:
         TypeError: It is no UFL form, or a coefficient or constant has no values.
-        ValueError: It is zero, has no or several meshes, an unknown tag, an element other than THCCS, spaces that are not
-            refinements of one another, or a cell size.
+        ValueError: It is zero, has no or several meshes, an unknown tag, an element other than THCCS, spaces that are
+            not refinements of one another, or a cell size.
         NotImplementedError: It has integrals other than dx.
         OSError: There is no C compiler, or the cache can't be written.
     """
@@ -125,7 +126,7 @@ def form(
         _check_integral(integral, mesh)
     arguments = tuple(ufl_form.arguments())
     for function in (*arguments, *ufl_form.coefficients()):
-        _check_element(function)
+        _check_space(function, function.ufl_function_space())
     _check_values(ufl_form)
     spaces = tuple(argument.ufl_function_space() for argument in arguments)
     all_spaces = [*spaces, *(function.function_space for function in ufl_form.coefficients())]
@@ -149,22 +150,22 @@ def form(
 
 
 def _check_form(ufl_form: object) -> None:
-    integrals = ufl_form.integrals() if isinstance(ufl_form, ufl.Form) else ()
-    is_form = isinstance(ufl_form, ufl.Form | ufl.ZeroBaseForm)
-    if is_form and all(isinstance(integral.integrand(), ufl.classes.Zero) for integral in integrals):
+    if not isinstance(ufl_form, ufl.Form | ufl.ZeroBaseForm):
+        given = type(ufl_form).__name__
+        raise TypeError(f"form needs a sum of UFL integrals, got {given}: is there a * ufl.dx missing?")
+    integrals = () if isinstance(ufl_form, ufl.ZeroBaseForm) else ufl_form.integrals()
+    if all(isinstance(integral.integrand(), ufl.classes.Zero) for integral in integrals):
         raise ValueError(
             "the form is zero, so that nothing is known of its functions: for a zero right-hand side write "
             "fem.Constant(msh, 0.0) * v * ufl.dx"
         )
-    if not is_form:
-        raise TypeError(f"form needs a sum of UFL integrals, got {type(ufl_form).__name__}: is there a * ufl.dx missing?")
 
 
 def _mesh(ufl_form: ufl.Form) -> ControlMesh:
     """Return the mesh of all measures, functions, constants and coordinates."""
     domains = {*ufl_form.ufl_domains(), *(d for integral in ufl_form.integrals() for d in extract_domains(integral))}
     if len(domains) != 1:
-        raise ValueError(f"the form has measures or functions on {len(domains)} meshes: all must be on one control mesh")
+        raise ValueError(f"the form has measures or functions on {len(domains)} meshes: all must be on one")
     (domain,) = domains
     if not isinstance(domain, Domain):
         raise ValueError(
@@ -180,8 +181,8 @@ def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
     if kind != "cell":
         measure = ufl.measure.integral_type_to_measure_name[kind]
         raise NotImplementedError(
-            f"the form has an integral over {measure} ({kind}); only dx is implemented. On an edge of the boundary impose "
-            f"values by fem.dirichletbc, or leave the term out for natural conditions that are homogeneous."
+            f"the form has an integral over {measure} ({kind}); only dx is implemented. On the boundary impose values "
+            f"by fem.dirichletbc, or leave the term out for homogeneous natural conditions."
         )
     if integral.subdomain_data() is not None:
         raise ValueError(
@@ -190,21 +191,20 @@ def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
     for tag in ids if isinstance(ids, tuple) else (ids,):
         if tag != "everywhere" and not (tag >= 0 and (mesh.face_tags == tag).any()):
             known = sorted({int(t) for t in mesh.face_tags})
-            raise ValueError(f"the form has dx({tag!r}), but tags are non-negative integers and those of the mesh: {known}")
+            raise ValueError(f"the form has dx({tag!r}), but tags are from 0, and those of the mesh are {known}")
     for terminal in traverse_unique_terminals(integral.integrand()):
         if isinstance(terminal, SIZES):
             raise ValueError(
-                f"the form has {type(terminal).__name__}, which can't be computed on curved cells: hand the cell size in as "
-                f"data, a fem.Function or fem.Constant, or use sqrt(abs(ufl.JacobianDeterminant(msh.ufl_domain())))"
+                f"the form has {type(terminal).__name__}, which can't be computed on curved cells: hand the cell size "
+                f"in as data, a fem.Function or fem.Constant, or weight the values of fem.assemble_cells with it"
             )
 
 
-def _check_element(function: ufl.Argument | ufl.Coefficient) -> None:
-    if not element.is_ours(function.ufl_element()) or not isinstance(function.ufl_function_space(), FunctionSpace):
+def _check_space(function: ufl.core.expr.Expr, space: ufl.FunctionSpace) -> None:
+    if not isinstance(space, FunctionSpace):
         raise ValueError(
-            f"{function} has the element {function.ufl_element()!r} and the space "
-            f"{type(function.ufl_function_space()).__qualname__}; all arguments and functions must be in spaces from "
-            f'fem.functionspace(msh, ("THCCS", 3)): use fem.project to carry others over'
+            f"{function} has the element {space.ufl_element()!r}, but all arguments and functions of a form must be in "
+            f'spaces from fem.functionspace(msh, ("THCCS", 3)): use fem.project to carry others over'
         )
 
 
@@ -268,7 +268,8 @@ def _quadrature_degree(integral: ufl.Integral) -> int:
     """Return the default degree: see `form`."""
     lowered = apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(ufl.Form([integral])))
     integrands = [part.integrand() for part in lowered.integrals()]
-    degrees = map_expr_dags(_ParametricDegree(element.DEGREE, {}), integrands)
+    estimator = _ParametricDegree(element.DEGREE, {})  # type: ignore[no-untyped-call]  # the base class's __init__
+    degrees = map_expr_dags(estimator, integrands)
     return min(max(LEAST_DEGREE, *degrees), LARGEST_DEGREE) if degrees else LEAST_DEGREE
 
 

@@ -146,8 +146,8 @@ class Component:
 def functionspace(
     mesh: ControlMesh,
     element: tuple[Any, ...],
-    *,
     boundary: BoundaryRule = "clamped",
+    *,
     cap_level: int = CAP_LEVEL,
 ) -> FunctionSpace:
     """Return the THCCS space on the limit surface of a control mesh.

@@ -1,0 +1,97 @@
+"""Rates of uniform refinement: full order where the mesh is regular, that of the masks at extraordinary vertices.
+
+Expected rates in L2 and H1 are theory where it exists (order 4 and 3; 2.5 and 1.5 with the Catmull-Clark boundary rule;
+powers of the subdominant eigenvalue at an extraordinary vertex). Bounds of the last errors are 1.2 times what was measured.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import cos, log2, pi, sqrt
+
+import numpy as np
+import pytest
+import ufl
+from problems import errors, lifted, poisson, projected_in_h1, smooth, uniformly_refined, wavy
+from thccs_fem import fem, generators
+from thccs_fem.boundary import BoundaryRule
+from thccs_fem.mesh import ControlMesh
+
+FULL = (4.0, 3.0)
+CREASE = (2.5, 1.5)
+FITTED = 3  # levels
+
+
+def half_torus(n: int, m: int) -> ControlMesh:
+    """Return half of a torus, n faces along and m around the tube: no extraordinary vertex, two circles for a rim."""
+    along, around = np.meshgrid(np.linspace(0.0, pi, n + 1), 2 * pi * np.arange(m) / m, indexing="ij")
+    distance = 2.0 + np.cos(around)
+    points = np.stack([distance * np.cos(along), distance * np.sin(along), np.sin(around)], axis=-1)
+    i, j = np.meshgrid(np.arange(n), np.arange(m), indexing="ij")
+    corners = [i * m + j, (i + 1) * m + j, (i + 1) * m + (j + 1) % m, i * m + (j + 1) % m]
+    return ControlMesh(points.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 4))
+
+
+def subdominant(valence: int) -> float:
+    """Return the eigenvalue of Catmull and Clark's masks by which rings around the vertex shrink."""
+    c = cos(2 * pi / valence)
+    return (5 + c + cos(pi / valence) * sqrt(18 + 2 * c)) / 16
+
+
+def at_extraordinary(valence: int) -> tuple[float, float]:
+    """Return the rates of a space that holds linear functions near the vertex and no quadratic ones."""
+    halvings = -log2(subdominant(valence))
+    return min(4.0, 3 * halvings), min(3.0, 2 * halvings)
+
+
+@dataclass(frozen=True)
+class Case:
+    mesh: Callable[[], ControlMesh]
+    rates: tuple[float, float]  # in L2 and H1
+    levels: int
+    last: tuple[float, float]  # bounds of the errors on the last level
+    rule: BoundaryRule = "clamped"
+    tolerance: float = 0.1
+
+
+CASES = {
+    # In the plane: Poisson's equation with Dirichlet data.
+    "square": Case(lambda: generators.rectangle((4, 4)), FULL, 5, (1, 1)),
+    "square, crease": Case(lambda: generators.rectangle((4, 4)), CREASE, 5, (1, 1), "crease"),
+    "wheel3": Case(lambda: generators.wheel(3, 2), at_extraordinary(3), 5, (1, 1)),
+    "wheel5": Case(lambda: generators.wheel(5, 2), at_extraordinary(5), 5, (1, 1)),
+    "wheel6": Case(lambda: generators.wheel(6, 2), at_extraordinary(6), 5, (1, 1)),
+    "wheel8": Case(lambda: generators.wheel(8, 2), at_extraordinary(8), 5, (1, 1)),
+    # Closed surfaces: u - div(grad(u)) = f.
+    "torus": Case(lambda: generators.torus((16, 8)), FULL, 4, (1, 1)),
+    "cube sphere": Case(lambda: generators.cube_sphere(2), at_extraordinary(3), 5, (1, 1)),
+    "genus 3": Case(lambda: generators.genus3(levels=2), at_extraordinary(8), 3, (1, 1)),
+    # Surfaces with a curved rim: the same with Dirichlet data.
+    "half torus": Case(lambda: half_torus(8, 8), FULL, 4, (1, 1)),
+    "half torus, crease": Case(lambda: half_torus(8, 8), CREASE, 4, (1, 1), "crease"),
+    "lifted square": Case(lambda: lifted(generators.rectangle((4, 4))), FULL, 5, (1, 1)),
+    "lifted disc": Case(lambda: lifted(generators.disc(2)), at_extraordinary(3), 5, (1, 1)),
+    "vertex of valence 5 next to the rim": Case(lambda: lifted(generators.wheel(5, 1)), at_extraordinary(5), 6, (1, 1)),
+    "the same, crease": Case(lambda: lifted(generators.wheel(5, 1)), CREASE, 5, (1, 1), "crease"),
+}
+
+
+def run(case: Case) -> np.ndarray:
+    """Return the errors on each level, shape (levels, 2)."""
+    msh = case.mesh()
+    V = fem.functionspace(msh, ("THCCS", 3), boundary=case.rule)
+    x = ufl.SpatialCoordinate(msh)
+    found = []
+    for level in range(case.levels):
+        V = uniformly_refined(V) if level else V
+        exact = wavy(x) if msh.gdim == 2 else smooth(x)
+        uh = poisson(V, exact, 6.25 * exact) if msh.gdim == 2 else projected_in_h1(V, exact)
+        found.append(errors(uh, exact))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_rates(case: Case) -> None:
+    found = run(case)
+    rates = -np.polyfit(np.arange(FITTED), np.log2(found[-FITTED:]), 1)[0]
+    np.testing.assert_allclose(rates, case.rates, atol=case.tolerance)
+    assert (found[-1] < case.last).all()

@@ -1,0 +1,82 @@
+"""L2 projection into a space, which is what splines have in place of interpolation."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+import basix
+import ufl
+from thccs_fem import element
+from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
+from thccs_fem.fem.expression import ValueOrExpression, values_at
+from thccs_fem.fem.forms import form
+from thccs_fem.fem.function import Function
+from thccs_fem.fem.scipy import conjugate_gradients
+from thccs_fem.fem.space import FunctionSpace
+
+__all__ = ["project"]
+
+Floats = npt.NDArray[np.float64]
+
+DEGREE = 11  # of the quadrature for g(x): 6 x 6 points
+TOLERANCE = 1e-13  # mass matrices are scaled by their diagonal: 100 to 300 iterations on any mesh and refinement
+
+
+def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
+    """Return the L2 projection: of all functions of V the one nearest to a value, in the L2 norm over the surface.
+
+    Args:
+        value: UFL expression in the spatial coordinate, constants and functions (of V, or of refinements or coarsenings
+            of it); or g(x) with x of shape (3, m) (the last row is zero in the plane), which returns shape (m,), or
+            (k, m) for k components; or a number, or one for each component.
+        V: The space.
+
+    Raises:
+        TypeError: The value is none of these.
+        ValueError: The value has another shape than the functions of V.
+    """
+    if callable(value) and not isinstance(value, ufl.core.expr.Expr):
+        load = _load_at_points(value, V)
+    else:
+        load = _load(_as_ufl(value), V)
+    scalar = FunctionSpace(V.hierarchy)
+    mass = assemble_matrix(form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx))
+    projection = Function(V)
+    components = [conjugate_gradients(mass, b, TOLERANCE) for b in load.T]
+    projection.x.array = np.stack(components, axis=1).ravel()
+    return projection
+
+
+def _as_ufl(value: object) -> ufl.core.expr.Expr:
+    if isinstance(value, ufl.core.expr.Expr):
+        return value
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"a {type(value).__name__} cannot be projected: give a UFL expression, a function g(x), or numbers"
+        ) from error
+    return ufl.as_vector(numbers.tolist()) if numbers.ndim else ufl.as_ufl(float(numbers))
+
+
+def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
+    """Return the integrals of the value times each function, shape (num_functions, block_size)."""
+    if value.ufl_shape != V.value_shape:
+        raise ValueError(
+            f"a value of shape {value.ufl_shape} cannot be projected on functions of shape {V.value_shape}"
+        )
+    return assemble_vector(form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx)).reshape(-1, V.block_size)
+
+
+def _load_at_points(value: ValueOrExpression, V: FunctionSpace) -> Floats:
+    """Return the same for g(x)."""
+    cells = V.cells
+    pieces = np.arange(cells.num_pieces, dtype=np.int32)
+    points, weights = (np.asarray(a) for a in basix.make_quadrature(basix.CellType.quadrilateral, DEGREE))
+    along = element.bspline_values(points)
+    basis = (along[:, 1, :, None] * along[:, 0, None, :]).reshape(-1, 16)
+    areas = cells.area_element(pieces, points) * weights
+    values = values_at(value, V, pieces, points, V.block_size) * areas[:, :, None]
+    local = np.einsum("qi,pqc->pic", basis, values).reshape(-1, V.block_size)
+    return cells.rows(pieces).T @ local
