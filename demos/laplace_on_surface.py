@@ -8,8 +8,8 @@
 # %% [markdown]
 # # Laplace's equation on a smooth surface
 #
-# A quad control mesh stands for a smooth surface: the limit of Catmull-Clark subdivision. On that surface, here of genus
-# 3, we solve
+# A quad control mesh stands for a smooth surface: the limit of Catmull-Clark subdivision. On that surface, here of
+# genus 3, we solve
 #
 # $$ -\Delta_\Gamma u = 0 \text{ on } \Gamma \setminus (\Gamma_0 \cup \Gamma_1), \qquad
 #    u = 0 \text{ on } \Gamma_0, \qquad u = 1 \text{ on } \Gamma_1 , $$
@@ -22,6 +22,7 @@
 
 # %%
 import argparse
+import itertools
 import os
 from pathlib import Path
 
@@ -56,9 +57,9 @@ if comm is not None and comm.size > 1:
 # %% [markdown]
 # ## The control mesh and the two patches
 #
-# The patches are sets of *control-mesh faces*: refinement does not change the problem. The built-in model carries them as
-# face tags 1 and 2. On any other mesh we take, in each connected part, the faces nearest to the two ends of its longest
-# axis.
+# The patches are sets of *control-mesh faces*: refinement does not change the problem. The built-in model carries them
+# as face tags 1 and 2. On any other mesh we take, in each connected part, the faces nearest to the two ends of its
+# longest axis.
 
 
 # %%
@@ -94,8 +95,8 @@ print(f"{msh}\n{V}")
 # %% [markdown]
 # ## Solve, estimate, refine
 #
-# The weak form is what one would write for DOLFINx. `fem.region_dofs` names the functions that do not vanish on a set of
-# faces; prescribing all of them fixes the solution there, whatever the level of refinement.
+# The weak form is what one would write for DOLFINx. `fem.region_dofs` names the functions that do not vanish on a set
+# of faces; prescribing all of them fixes the solution there, whatever the level of refinement.
 
 
 # %%
@@ -150,11 +151,11 @@ print(f"Wrote {arguments.out / 'laplace.vtu'} and {arguments.out / 'laplace.png'
 # %% [markdown]
 # ## Check
 #
-# The spaces are nested and the conditions are the same on each of them, so the energy $\int |\nabla u_h|^2$ can only fall
-# towards that of the solution. The maximum principle holds for the solution, and for $u_h$ up to its error.
+# The spaces are nested and the conditions are the same on each of them, so the energy $\int |\nabla u_h|^2$ can only
+# fall towards that of the solution. The maximum principle holds for the solution, and for $u_h$ up to its error.
 
 # %%
-assert all(after <= before * (1 + 1e-6) for before, after in zip(energies, energies[1:], strict=False))
+assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(energies))
 values = uh.x.array
 assert values.min() > -0.1, values.min()
 assert values.max() < 1.1, values.max()

@@ -68,7 +68,7 @@ def wavy(x: Expr) -> Expr:
 
 def smooth(x: Expr) -> Expr:
     """Return a function of space."""
-    return ufl.sin(x[0] + 0.5) * ufl.exp(0.3 * x[1]) + 0.2 * x[2] ** 2
+    return ufl.sin(0.4 * x[0] + 0.5) * ufl.exp(0.1 * x[1]) + 0.03 * x[2] ** 2
 
 
 def singular(x: Expr) -> Expr:

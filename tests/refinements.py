@@ -13,7 +13,7 @@ from zoo import ZOO
 
 from thccs_fem import element
 from thccs_fem.boundary import to_dofs
-from thccs_fem.extraction import Cells, extract
+from thccs_fem.extraction import Cells
 from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy, Stage
 
 # Levels 0 .. 3: no cap has to sink below CAP_LEVEL, so that all hierarchies of a mesh have the same caps.
@@ -118,8 +118,8 @@ INWARD = np.roll(ALONG, -1, axis=0)
 
 @dataclass(frozen=True)
 class EdgePoints:
-    """Points on common edges of pieces, seen from both sides: pieces, coordinates, the vector that crosses the edge, and
-    whether both pieces are faces with four regular corners."""
+    """Points on common edges of pieces, seen from both sides: pieces, coordinates, the vector that crosses the edge,
+    and whether both pieces are faces with four regular corners."""
 
     piece: np.ndarray
     uv: np.ndarray
@@ -198,22 +198,3 @@ def derivatives_across(local: np.ndarray, points: EdgePoints, side: int) -> np.n
 
 def _bspline_curvatures(t: np.ndarray) -> np.ndarray:
     return np.stack([1.0 - t, 3.0 * t - 2.0, 1.0 - 3.0 * t, t], axis=-1)
-
-
-__all__ = [
-    "CASES",
-    "MESHES",
-    "STEPS",
-    "WITH_RIM",
-    "bernstein_mass",
-    "bernstein_rows",
-    "coarsest",
-    "derivatives_across",
-    "edge_points",
-    "extract",
-    "geometry_dofs",
-    "random_positions",
-    "random_vector",
-    "refinements",
-    "scaled_eigenvalue",
-]

@@ -27,7 +27,7 @@ from thccs_fem.hierarchy import Hierarchy
 
 EXACT = 1e-12  # sums of some dozen products of numbers up to 1
 NESTED = 1e-11  # a few levels of them
-INDEPENDENT = 1e-4  # least scaled eigenvalue of the mass matrix; 5e-4 at the worst of 1500 refinements, 1e-15 if dependent
+INDEPENDENT = 1e-4  # least scaled eigenvalue of the mass matrix: 4.9e-4 at the worst of 1500, 1e-15 if dependent
 
 
 def evaluated(hierarchy, u, positions):
@@ -37,7 +37,7 @@ def evaluated(hierarchy, u, positions):
 
 
 @pytest.mark.parametrize(("name", "rule"), CASES)
-@settings(max_examples=4)
+@settings(max_examples=3)
 @given(steps=STEPS)
 def test_the_functions_are_a_basis_that_holds_the_surface(name, rule, steps):
     hierarchies = refinements(name, rule, steps)
@@ -52,14 +52,34 @@ def test_the_functions_are_a_basis_that_holds_the_surface(name, rule, steps):
     carried = hierarchy.prolongation(hierarchies[0]) @ geometry_dofs(hierarchies[0])
     np.testing.assert_allclose(carried, points, rtol=0, atol=EXACT * size)
     np.testing.assert_allclose(cells.local(points), cells.piece_points, rtol=0, atol=EXACT * size)
-    # Independence: the mass matrix in the parameters of the control mesh.
+    assert independence(cells, rows) > INDEPENDENT
+
+
+def independence(cells, rows) -> float:
+    """The least scaled eigenvalue of the mass matrix in the parameters of the control mesh."""
     area = np.abs(np.linalg.det(cells.piece_axes)) * 4.0 ** -cells.level[cells.piece_cell]
     mass = sp.kron(sp.diags_array(area), sp.csr_array(np.kron(bernstein_mass(), bernstein_mass())), format="csr")
-    assert scaled_eigenvalue((rows.T @ mass @ rows).toarray()) > INDEPENDENT
+    return scaled_eigenvalue((rows.T @ mass @ rows).toarray())
+
+
+def test_faces_with_four_corners_of_valence_3_are_never_all_that_is_left_of_level_0(monkeypatch):
+    # The support of the function at the inner corner holds all faces but the ends of the two arms. There subdivision
+    # takes +1 and -1 at alternate vertices to zero, so that the functions left would be dependent.
+    coarse = coarsest("l_tricube", "crease")
+    (support,) = coarse.support(np.array([0]))
+    assert np.count_nonzero(~support) == 2
+    assert coarse.refined(np.array([0])).refined_keys[0].size == coarse.root.num_faces
+    far = np.array([10])  # a function elsewhere: what is left has other faces too, and still these two go with it
+    assert not coarse.support(far)[0][~support].all()
+    assert np.isin(np.flatnonzero(~support), coarse.refined(far).refined_keys[0]).all()
+
+    monkeypatch.setattr("thccs_fem.hierarchy._dependent_faces", lambda root: np.zeros(root.num_faces, dtype=bool))
+    cells = extract(coarse.refined(np.array([0])))
+    assert independence(cells, bernstein_rows(cells)) < 1e-12
 
 
 @pytest.mark.parametrize(("name", "rule"), CASES)
-@settings(max_examples=3)
+@settings(max_examples=2)
 @given(steps=STEPS)
 def test_spaces_are_nested(name, rule, steps):
     hierarchies = refinements(name, rule, steps)
@@ -102,8 +122,10 @@ def test_caps_are_continuous_only():
     assert jumps[1, points.regular].max() < NESTED
 
 
-@pytest.mark.parametrize(("name", "rule"), CASES)
-@settings(max_examples=2)
+@pytest.mark.parametrize(
+    ("name", "rule"), [("wheel5", "crease"), ("polygons", "clamped"), ("tripod", "crease"), ("torus_of_nine", "crease")]
+)
+@settings(max_examples=3)
 @given(steps=STEPS)
 def test_cells_pieces_and_batches_fit_together(name, rule, steps):
     hierarchy = refinements(name, rule, steps)[-1]
@@ -166,7 +188,8 @@ def test_a_point_is_located_where_its_piece_says(name, steps):
     # In the cell, then up the tree by the digits of its key, to the face of level 0.
     cell = cells.piece_cell[piece]
     place = cells.piece_origin[piece] + np.einsum("nij,nj->ni", cells.piece_axes[piece], inner)
-    key = np.array([hierarchy.stages[l].level.keys[f] for l, f in zip(cells.level, cells.level_face, strict=True)])[cell]
+    key = np.array([hierarchy.stages[l].level.keys[f] for l, f in zip(cells.level, cells.level_face, strict=True)])
+    key = key[cell]
     for n in range(faces.size):
         for _ in range(cells.level[cell[n]]):
             k, key[n] = key[n] % 4, key[n] // 4
@@ -229,7 +252,8 @@ def test_boundary_pieces_go_round_the_rim_once():
     rim = np.flatnonzero(np.isin(mesh.face_edges, mesh.boundary_edges))
     assert np.array_equal(np.unique(half_edge), rim)
     np.testing.assert_allclose(np.bincount(half_edge, length)[rim], 2.0, rtol=0, atol=EXACT)
-    assert np.array_equal(cells.face[cells.piece_cell[piece]], np.searchsorted(mesh.face_offsets, half_edge, "right") - 1)
+    faces = np.searchsorted(mesh.face_offsets, half_edge, "right") - 1
+    assert np.array_equal(cells.face[cells.piece_cell[piece]], faces)
 
 
 def test_arrays_of_batches_are_read_only():

@@ -51,9 +51,7 @@ def test_load_is_source_times_test_function(equation) -> None:
     [(1, 3 / 4), (X[0], 3 / 8 + 3 / 16), (TENSOR, 2 * 3 / 4 + 2 * 3 / 4)],
     ids=["one", "scalar", "tensor"],
 )
-def test_strong_residual_has_the_sign_of_the_source(
-    equation, kappa: Expr | float, divergence: float
-) -> None:
+def test_strong_residual_has_the_sign_of_the_source(equation, kappa: Expr | float, divergence: float) -> None:
     assert at_point(equation.strong_residual(u, f, kappa)) == pytest.approx(1 / 2 + divergence)
 
 

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-import ufl
 from problems import moved_inside, poisson, randomly_refined
+
+import ufl
 from thccs_fem import adapt, element, fem, generators, limit
 from thccs_fem.boundary import BoundaryRule
 from thccs_fem.mesh import ControlMesh

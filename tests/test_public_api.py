@@ -17,9 +17,7 @@ import thccs_fem
 # defaults.
 ANY = inspect.Parameter.empty
 SIGNATURES = {
-    "mesh.ControlMesh": (
-        "vertices, faces, face_tags=None, edge_tags=None, creases=None, corners=None, comm=None"
-    ),
+    "mesh.ControlMesh": ("vertices, faces, face_tags=None, edge_tags=None, creases=None, corners=None, comm=None"),
     "mesh.ControlMesh.ufl_domain": "self",
     "mesh.orient": "vertices, faces",
     "generators.torus": "shape, /, R=2, r=1",

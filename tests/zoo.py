@@ -139,7 +139,7 @@ def prism(n: int) -> ControlMesh:
 
 
 def polygons() -> ControlMesh:
-    """Return a triangle, a quad and a pentagon around a vertex in the plane, and a hexagon on their rim."""
+    """Return a triangle and three quads around a vertex in the plane, and a pentagon beside them."""
     points = [(0, 0), (2, -1), (2, 1), (1, 2), (-1, 2), (-2, 0.5), (-1.5, -1.5), (0.5, -2), (3, 1.5), (4, 0), (3, -1)]
     faces = [[0, 1, 2], [0, 2, 3, 4], [0, 4, 5, 6], [0, 6, 7, 1], [1, 10, 9, 8, 2]]
     return ControlMesh(moved(points), faces)
@@ -152,7 +152,7 @@ def tetrahedron() -> ControlMesh:
 
 def beside(*meshes: ControlMesh) -> ControlMesh:
     """Return the meshes, side by side, as components of one."""
-    points = np.vstack([mesh.vertices + [10.0 * i, 0.0, 0.0] for i, mesh in enumerate(meshes)])
+    points = np.vstack([mesh.vertices + np.array([10.0 * i, 0.0, 0.0]) for i, mesh in enumerate(meshes)])
     first = np.cumsum([0, *(mesh.num_vertices for mesh in meshes)])
     return ControlMesh(points, np.vstack([mesh.quads + shift for mesh, shift in zip(meshes, first, strict=False)]))
 

@@ -26,17 +26,15 @@ Floats = npt.NDArray[np.float64]
 Strategy = Literal["worst", "maximum", "dorfler"]
 
 
-def mark(
-    V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: float = 0.5
-) -> npt.NDArray[np.int64]:
+def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: float = 0.5) -> npt.NDArray[np.int64]:
     """Mark functions for refinement.
 
     Args:
         V: The space.
         eta: Indicator of each cell, not squared, shape (num_cells,), local.
-        strategy: "worst": the one function with the largest indicator (the paper's rule). "maximum": all whose indicator
-            is at least theta times the largest. "dorfler": the fewest functions, the largest indicators first, whose
-            supports together carry theta of the sum of squares.
+        strategy: "worst": the one function with the largest indicator (the paper's rule). "maximum": all whose
+            indicator is at least theta times the largest. "dorfler": the fewest functions, the largest indicators
+            first, whose supports together carry theta of the sum of squares.
         theta: Parameter of "maximum" and "dorfler", in (0, 1].
 
     Returns:
@@ -52,6 +50,8 @@ def mark(
     if not np.isfinite(eta).all() or (eta < 0.0).any():
         bad = int(np.flatnonzero(~np.isfinite(eta) | (eta < 0.0))[0])
         raise ValueError(f"eta of cell {bad} is {eta[bad]}; indicators must be finite and not negative")
+    if strategy not in ("worst", "maximum", "dorfler"):
+        raise ValueError(f'strategy is {strategy!r}; it must be "worst", "maximum" or "dorfler"')
     if not 0.0 < theta <= 1.0:
         raise ValueError(f"theta is {theta}; it must lie in (0, 1]")
     supports = _supports(cells)
@@ -62,9 +62,7 @@ def mark(
         return np.array([np.argmax(indicator)])
     if strategy == "maximum":
         return np.flatnonzero(indicator >= theta * indicator.max())
-    if strategy == "dorfler":
-        return _dorfler(supports, indicator, eta**2, theta)
-    raise ValueError(f'strategy is {strategy!r}; it must be "worst", "maximum" or "dorfler"')
+    return _dorfler(supports, indicator, eta**2, theta)
 
 
 def _supports(cells: Cells) -> sp.csr_array:
@@ -180,7 +178,9 @@ def solve(
     if steps < 0:
         raise ValueError(f"steps is {steps}; it must not be negative")
     history = History()
-    with tqdm(total=steps + 1, desc="adaptive run", unit="step", disable=None if progress is None else not progress) as bar:
+    with tqdm(
+        total=steps + 1, desc="adaptive run", unit="step", disable=None if progress is None else not progress
+    ) as bar:
         for number in range(steps + 1):
             start = time.perf_counter()
             u = solver(V)

@@ -6,8 +6,8 @@ Three masks give the bicubic patch of a regular face exactly, and a C0 cap at an
 * edge point at a vertex: mean of the two I on either side; (2 P_k + P_neighbour) / 3 along the boundary;
 * vertex point: mean of all I around, which is the limit mask; (P- + 4 P + P+) / 6 on a smooth boundary, P at a corner.
 
-Each belongs to a vertex, an edge or a face corner, so neighbouring patches meet.  Coefficients are numbered i + 4 j, i along
-the edge from corner 0 to 1, j along that from 0 to 3.  Trace functions change the boundary rows alone.
+Each belongs to a vertex, an edge or a face corner, so neighbouring patches meet.  Coefficients are numbered i + 4 j, i
+along the edge from corner 0 to 1, j along that from 0 to 3.  Trace functions change the boundary rows alone.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _face_corner_points(level: Level, num_functions: int) -> sp.csr_array:
 
 
 def _averages(level: Level, half_edges: Ints) -> sp.csr_array:
-    """Return the means of I that are no boundary rows, shape (4 * n, num_half_edges); see `bezier_masks` for the rows."""
+    """Return the means of I that are no boundary rows, in the order of `bezier_masks`, shape (4 * n, num_half_edges)."""
     row = 4 * np.arange(half_edges.size)
     previous = level.previous[half_edges]
     across, across_previous = level.twins[half_edges], level.twins[previous]

@@ -2,7 +2,8 @@
 
 At a boundary vertex v with two faces the crease rule continues the surface by a phantom point 2 P_v - P_w, w the vertex
 across.  The clamped space frees that point: delta_v is how far the ghost lies from the phantom.  Its functions are
-N_i(s) (1 - t)^3 / 6 along the rim, and all of its algebra is a correction to the crease rule on the rim alone.  A corner of
+N_i(s) (1 - t)^3 / 6 along the rim, and all of its algebra is a correction to the crease rule on the rim alone.  A
+corner of
 one face has three such scalars: along its outgoing rim edge (A), its incoming one (B), and mixed (M).
 
 The degrees of freedom that make it clamped, written q, are values of the trace and a third of an edge inside:
@@ -27,7 +28,16 @@ import scipy.sparse as sp
 
 from thccs_fem.subdivision import Bools, Ints, Level, Step
 
-__all__ = ["Boundary", "BoundaryRule", "from_dofs", "subdivision_matrix", "summed", "support_of_traces", "to_dofs", "traces_meeting"]
+__all__ = [
+    "Boundary",
+    "BoundaryRule",
+    "from_dofs",
+    "subdivision_matrix",
+    "summed",
+    "support_of_traces",
+    "to_dofs",
+    "traces_meeting",
+]
 
 BoundaryRule = Literal["clamped", "crease"]
 
@@ -35,7 +45,7 @@ SMOOTH, CORNER_OUT, CORNER_IN, CORNER_MIXED = 0, 1, 2, 3  # kinds of trace funct
 TIED_ZONE = 1  # edges along the rim from an irregular vertex within which delta is 0
 
 Floats = npt.NDArray[np.float64]
-Triplets = list[tuple[Ints, Ints, Floats | float]]
+Triplets = list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer], Floats | float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +247,8 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
     )
     corners: Triplets = [(c, c, 2.25)]
     around: Triplets = [
-        (c, neighbour, weight) for neighbour, weight in zip(boundary.corner_faces.T[1:], (-0.5, -0.25, -0.5), strict=True)
+        (c, neighbour, weight)
+        for neighbour, weight in zip(boundary.corner_faces.T[1:], (-0.5, -0.25, -0.5), strict=True)
     ]
     return sp.csr_array(rims + summed(corners, (size, size)) + summed(around, (size, size)) @ rims)
 
@@ -245,8 +256,8 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
 def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:
     """Return the trace functions whose support meets the marked faces, shape (num_traces,).
 
-    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2, the walk ending at corners; of a corner's
-    q10 and q01 those of the two edges along its rim; of q00 its one face.
+    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2, the walk ending at corners; of a
+    corner's q10 and q01 those of the two edges along its rim; of q00 its one face.
     """
     level = boundary.level
     a, b, hit = _rim_edges(level, faces)

@@ -84,8 +84,8 @@ def norm(V: FunctionSpace, eta: Floats) -> float:
 def _tangential(V: FunctionSpace, gradient: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
     """Return the part of a gradient that is tangential to the surface.
 
-    That of a THCCS function is tangential already, but UFL's gradient of an expression in the spatial coordinate is the one
-    in space: on a surface the difference of the two has a normal part, which has nothing to do with the error.
+    That of a THCCS function is tangential already, but UFL's gradient of an expression in the spatial coordinate is the
+    one in space: on a surface the difference of the two has a normal part, which has nothing to do with the error.
     """
     if V.mesh.gdim == 2:
         return gradient

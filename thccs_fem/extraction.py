@@ -67,7 +67,7 @@ class Batch:
         return np.repeat(self.cells, np.diff(self.offsets))
 
     def local(self, u: Floats) -> Floats:
-        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, k), for u of shape (num_dofs, k)."""
+        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, k); u has shape (num_dofs, k)."""
         if self.operators is None:
             return u[self.dofs]
         values = np.where((self.dofs >= 0)[..., None], u[self.dofs], 0.0)
@@ -184,7 +184,7 @@ class Cells:
         return np.sqrt(np.maximum(uu * vv - uv_**2, 0.0))
 
     def local(self, u: Floats) -> Floats:
-        """Return the local B-spline coefficients of all pieces, shape (num_pieces, 16, k), for u of shape (num_dofs, k)."""
+        """Return the local B-spline coefficients of all pieces, shape (num_pieces, 16, k); u has shape (num_dofs, k)."""
         return np.concatenate([batch.local(u) for batch in self.batches])
 
     def locate(
@@ -368,7 +368,7 @@ def _batches(cell: Ints, nodes: Ints, rows: sp.csr_array) -> tuple[tuple[Batch, 
     if same.size:
         dofs = rows.indices[rows.indptr[16 * same][:, None] + np.arange(16)].astype(np.int32)
         batches.append(Batch(cell[same], dofs, np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
-    others = np.flatnonzero(~identity)
+    others = np.flatnonzero(~identity).astype(np.int32)
     others = others[np.argsort(cell[others], kind="stable")]
     general, order = _general_batches(cell[others], nodes[others], rows, others)
     return (*batches, *general), np.concatenate([same, *order]).astype(np.int32)
@@ -430,7 +430,9 @@ def _dofs_of_cells(entries: sp.csr_array, cell_rows: Ints) -> tuple[Ints, Ints]:
     return offsets, dofs
 
 
-def _run(function: str, num_cells: int, cell_rows: Ints, entries: sp.csr_array, *arrays: npt.NDArray[Any] | None) -> None:
+def _run(
+    function: str, num_cells: int, cell_rows: Ints, entries: sp.csr_array, *arrays: npt.NDArray[Any] | None
+) -> None:
     """Call a loop of kernels.c on the rows of cells."""
     module = jit.library()
     c_types = {"i4": "int32_t[]", "i8": "int64_t[]", "f8": "double[]"}

@@ -1,8 +1,8 @@
 """Does a planar surface fold?  The sign of det J on its pieces, and far down at tagged corners.
 
 On a folded map |det J| hides the sign and the patch test fails by 1e-2 whatever the depth; a mesh that folds is refused
-by name.  With plain masks a corner with two or more faces folds where its angle exceeds 90 degrees a face, but only some
-levels below the control mesh, so the faces there are followed down to FOLD_LEVEL.
+by name.  With plain masks a corner with two or more faces folds where its angle exceeds 90 degrees a face, but only
+some levels below the control mesh, so the faces there are followed down to FOLD_LEVEL.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ Floats = npt.NDArray[np.float64]
 
 
 def check_no_folds(cells: Cells) -> None:
-    """Raise ValueError where a planar surface folds, naming faces of the control mesh; surfaces in space always pass."""
+    """Raise ValueError where a planar surface folds, naming faces of the control mesh; others always pass."""
     mesh = cells.hierarchy.mesh
     if mesh.gdim != 2:
         return
     folded = np.unique(cells.face[cells.piece_cell[_folds(element.TO_BERNSTEIN @ cells.piece_points)]])
     if folded.size:
         raise ValueError(
-            f"the planar surface folds (det J <= 0) on {folded.size} of {mesh.num_faces} faces, first {folded[:SHOWN].tolist()}: "
+            f"the planar surface folds (det J <= 0) on {folded.size} of {mesh.num_faces} faces, first "
+            f"{folded[:SHOWN].tolist()}: "
             f"move the vertices of these faces until neighbouring edges no longer cross, or subdivide them more evenly"
         )
     _check_tagged_corners(cells)
@@ -82,7 +83,9 @@ def _refuse(cells: Cells, level: Level, folded: Ints) -> None:
     corner = int(control[control >= 0][0])
     raise ValueError(
         f"the planar surface folds (det J <= 0) at level {level.number} at the tagged corner, vertex {corner} with "
-        f"{level.vertex_num_faces[level.control_vertex == corner][0]} faces, on faces {faces[:SHOWN].tolist()}: plain masks "
-        f"span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the spacing of the "
+        f"{level.vertex_num_faces[level.control_vertex == corner][0]} faces, on faces {faces[:SHOWN].tolist()}: plain "
+        f"masks "
+        f"span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the spacing "
+        f"of the "
         f"edges next to it, or remove its tag"
     )

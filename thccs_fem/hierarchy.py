@@ -7,14 +7,14 @@ Omega^{l+1}, a set of faces of level l inside Omega^l, is all that is stored; ev
     C_0 = I,   C_{l+1} = Z_{l+1} S_l C_l + E_{l+1}
 
 C_l holds the coefficients of every active function in terms of the functions of level l.  Z zeroes the rows of
-selected^{l+1}: *this is the truncation*; E has a unit column for each newly active function.  One array, `selected`, is both
-what is activated and what is discarded, so the functions form a partition of unity whatever is refined.
+selected^{l+1}: *this is the truncation*; E has a unit column for each newly active function.  One array, `selected`, is
+both what is activated and what is discarded, so the functions form a partition of unity whatever is refined.
 
 Dofs are numbered level by level, within a level vertices first, then traces, each in the order of the level.
 
 Faces with an irregular vertex that are not refined are cut by the same subdivision, down to one absolute level for each
-extraordinary vertex (`cap_levels`), where a bicubic cap ends the cut.  Cut faces ride along in the levels: functions outside
-of Omega^{l+1} keep their untruncated rows in C_{l+1}, so the same matrices give the pieces of cut faces.
+extraordinary vertex (`cap_levels`), where a bicubic cap ends the cut.  Cut faces ride along in the levels: functions
+outside of Omega^{l+1} keep their untruncated rows in C_{l+1}, so the same matrices give the pieces of cut faces.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse import csgraph
 
 from thccs_fem.boundary import (
     Boundary,
@@ -39,7 +38,17 @@ from thccs_fem.boundary import (
     traces_meeting,
 )
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import Bools, Ints, Level, Step, control_level, in_quads, in_sub_quads, neighbourhood, subdivide
+from thccs_fem.subdivision import (
+    Bools,
+    Ints,
+    Level,
+    Step,
+    control_level,
+    in_quads,
+    in_sub_quads,
+    neighbourhood,
+    subdivide,
+)
 
 __all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
 
@@ -201,12 +210,16 @@ class Hierarchy:
     def refined(self, dofs: npt.NDArray[np.integer]) -> Self:
         """Return the hierarchy in which the supports of the given dofs are refined once more (sec. 4.1).
 
+        With them the faces of level 0 on which functions are dependent, lest these be all that is left of level 0.
+
         Args:
             dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
         """
         keys: list[Keys] = [*self.refined_keys, np.zeros(0, dtype=np.int64)]
         for l, support in enumerate(self.support(dofs)):
             keys[l] = np.union1d(keys[l], self.stages[l].level.keys[support])
+        if keys[0].size:
+            keys[0] = np.union1d(keys[0], self.root.keys[_dependent_faces(self.root)])
         return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
 
     def truncated_to(self, num_levels: int) -> Self:
@@ -217,7 +230,7 @@ class Hierarchy:
         """Return whether every function of `other` is a function of this hierarchy."""
         return (
             self.mesh is other.mesh
-            and self.rule == other.rule
+            and (self.rule, self.cap_level) == (other.rule, other.cap_level)
             and len(other.refined_keys) <= len(self.refined_keys)
             and all(np.isin(o, k).all() for k, o in zip(self.refined_keys, other.refined_keys, strict=False))
         )
@@ -232,8 +245,9 @@ class Hierarchy:
         """
         if not self.is_refinement_of(coarse):
             raise ValueError(
-                "the spaces are not nested: the target must be a refinement (by adapt.refine) of the source on the same "
-                "control mesh with the same boundary rule; use fem.project to carry a function between unrelated spaces"
+                "the spaces are not nested: the target must be a refinement (by adapt.refine) of the source on "
+                "the same control mesh with the same boundary rule; use fem.project to carry a function between "
+                "unrelated spaces"
             )
         carried = _coefficients(self.stages[: self.num_levels], coarse.stages)
         rows = [c[self.dof_functions(l)] for l, c in enumerate(carried)]
@@ -244,13 +258,18 @@ class Hierarchy:
         return self.num_levels == other.num_levels and self.is_refinement_of(other) and other.is_refinement_of(self)
 
 
+def _dependent_faces(root: Level) -> Bools:
+    """Return the faces with four corners of valence 3, inside, shape (num_faces,).
+
+    On such a face, and on no other, the functions of level 0 are dependent: S annihilates their alternating
+    vector there.
+    """
+    return ~root.touching(root.boundary | (root.vertex_num_faces != 3))
+
+
 def _is_dependent(root: Level) -> bool:
-    """Return if a closed component has only vertices of valence 3: S annihilates an alternating vector (Peters, Wu)."""
-    ends = (root.vertices, root.vertices[root.following])
-    graph = sp.csr_array((np.ones(root.vertices.size, dtype=bool), ends), shape=(root.num_vertices,) * 2)
-    component = csgraph.connected_components(graph, directed=False)[1]
-    others = component[(root.vertex_num_faces != 3) | root.boundary]
-    return bool(np.setdiff1d(component, others).size)
+    """Return whether a component has only vertices of valence 3, the cube: its functions are dependent as a whole."""
+    return not bool(neighbourhood(root, ~_dependent_faces(root)).all())
 
 
 def _as_level_zero(level: Level) -> Level:
@@ -353,7 +372,7 @@ def _coefficients(stages: Sequence[Stage], of: Sequence[Stage]) -> list[sp.csr_a
     first = 0
     for l, stage in enumerate(stages):
         size = stage.boundary.num_functions
-        selected, active = (_functions_on(stage, of[l]) if l < len(of) else (np.zeros(0, dtype=np.int32),) * 2)
+        selected, active = _functions_on(stage, of[l]) if l < len(of) else (np.zeros(0, dtype=np.int32),) * 2
         columns = first + np.arange(active.size)
         first += active.size
         unit = sp.csr_array((np.ones(active.size), (active, columns)), shape=(size, num_dofs))

@@ -1,4 +1,4 @@
-"""Control meshes from files.
+"""Control meshes from files; results are written by `thccs_fem.vtk.write_vtu`, which is `io.write_vtu` as well.
 
 OBJ, OFF and PLY files are read here, whatever meshio installs or knows: its own readers refuse
 good files of these formats. It reads all other formats. A reader returns a `_Surface`; vertices
@@ -22,8 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from thccs_fem import mesh
+from thccs_fem.vtk import write_vtu
 
-__all__ = ["read_mesh"]
+__all__ = ["read_mesh", "write_vtu"]
 
 type Floats = npt.NDArray[np.float64]
 type Indices = npt.NDArray[np.integer]

@@ -282,8 +282,8 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
 
 /* ---- Sparsity pattern ------------------------------------------------------------------------------------------ */
 
-void thccs_sparsity(int32_t num_dofs, const int32_t *cell_offsets, const int32_t *cell_dofs,
-                    const int32_t *dof_offsets, const int32_t *dof_cells, int32_t *restrict seen,
+void thccs_sparsity(int32_t num_dofs, const int32_t *restrict cell_offsets, const int32_t *restrict cell_dofs,
+                    const int32_t *restrict dof_offsets, const int32_t *restrict dof_cells, int32_t *restrict seen,
                     int32_t *restrict next, int32_t *restrict indices)
 {
   for (int32_t i = 0; i < num_dofs; ++i)

@@ -45,8 +45,8 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
                           const int32_t *indptr, const int64_t *starts, int32_t position_size,
                           const void *positions, double *values);
 
-/* Which dofs share a cell. First with indices NULL and next 0: next[i] becomes the length of row i; then with
-   next[i] the beginning of row i: its columns are written, in order. seen (num_dofs) is -1 before each call. */
+/* Which dofs share a cell. First with indices NULL and next 0: next[i] becomes the length of row i. Then with next[i]
+   the beginning of row i: its columns are written, in order. seen (num_dofs) is -1 before each call. */
 void thccs_sparsity(int32_t num_dofs, const int32_t *cell_offsets, const int32_t *cell_dofs,
                     const int32_t *dof_offsets, const int32_t *dof_cells, int32_t *seen, int32_t *next,
                     int32_t *indices);

@@ -225,7 +225,7 @@ class _Ends:
 def _descend(mesh: ControlMesh, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None) -> _Ends:
     """Return where the points end; arguments as for `evaluate`."""
     control = control_level(mesh)
-    left = np.arange(np.size(faces))
+    left: Indices = np.arange(np.size(faces))
     corners = np.broadcast_to(-1 if corner is None else np.asarray(corner), left.shape)
     ends = _Ends.none(corners, mesh.gdim)
     if mesh.is_quad:

@@ -1,7 +1,7 @@
 """Pictures by PyVista: the limit surface coloured by a function, with the sides of the elements drawn on it.
 
 Every bicubic piece is sampled here on a grid of n x n facets, with exact points, normals and values.  Linear
-interpolation on n segments errs by at most 0.75 / n^2 times the largest second difference of the Bernstein coefficients.
+interpolation on n segments errs by at most 0.75 / n^2 times the largest second difference of Bernstein coefficients.
 This gives n: no facet strays from the surface, and no gap opens between pieces, by as much as one could see.
 """
 
@@ -40,6 +40,7 @@ LIGHT: dict[str, Any] = {"ambient": 0.4, "diffuse": 0.65, "specular": 0.1, "spec
 MARGIN = 1.06  # what is seen, in terms of the surface
 BAR = 0.14  # part of the picture's width that is left to the scalar bar
 PLAIN = "#d5dbe3"  # colour of a surface without a function
+FAINT = 20.0  # pixels: where cells are smaller, lines are faint, else one would see them alone
 INK = "#20242c"  # colour of letters and of lines on it
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue
 ROUNDING = 1e-9  # values that differ less, of the largest, are one
@@ -73,7 +74,8 @@ def plot(
 
     Raises:
         TypeError: If `uh` is neither function nor space.
-        ValueError: If the file is not called .png, or the function has values that are not finite.
+        ValueError: If the file is not called .png, the function has values that are not finite, or `clim` is no
+        interval.
         OSError: If the file cannot be written, or there is nothing to draw on.
     """
     import pyvista
@@ -81,11 +83,11 @@ def plot(
     path = None if filename is None else _checked(Path(filename))
     facets, sides = surface(uh), mesh_lines(uh) if lines else None
     with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
-        plotter = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
+        plotter: Any = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
     try:
         _check_there_is_something_to_draw_on(plotter)
         plotter.set_background("white")
-        plotter.renderer.enable_anti_aliasing("ssaa")
+        plotter.enable_anti_aliasing("ssaa")
         if isinstance(uh, Function):
             _draw_function(plotter, uh, facets, sides, clim, cmap)
         else:
@@ -128,11 +130,13 @@ def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
         facets.append(num_points + _grid_facets(pieces.size, n))
         piece.append(np.repeat(pieces, n * n))
         num_points += len(points[-1])
-    mesh = pyvista.PolyData.from_regular_faces(in_space(np.concatenate(points)), np.concatenate(facets))
+    faces: Any = np.concatenate(facets)  # pyvista's types want Python's int
+    mesh = pyvista.PolyData.from_regular_faces(in_space(np.concatenate(points)), faces)
     mesh.point_data.active_normals = np.concatenate(normals)
     _add_values(mesh, uh, np.concatenate(sampled))
+    piece_of_facet = np.concatenate(piece)
     for name, numbers in cell_numbers(cells).items():
-        mesh.cell_data[name] = numbers[np.concatenate(piece)]
+        mesh.cell_data[name] = numbers[piece_of_facet]
     return mesh
 
 
@@ -206,7 +210,7 @@ def _difference(local: Floats, order: int) -> Floats:
 
 
 def _on_grid(along_u: Floats, along_v: Floats, local: Floats) -> Floats:
-    """Return values on the grids of pieces, u fastest, shape (num_pieces (n + 1)^2, k), from B-splines along u and v."""
+    """Return values on the grids of pieces, u fastest, shape (num_pieces (n + 1)^2, k), given B-splines on u and v."""
     return (np.kron(along_v, along_u) @ local).reshape(-1, local.shape[2])
 
 
@@ -309,14 +313,17 @@ def _draw(
     actors[0].mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 4.0)
     actors[1].mapper.SetRelativeCoincidentTopologyLineOffsetParameters(1.0, 2.0)
     if sides is not None:
-        plotter.add_mesh(sides, lighting=False, line_width=plotter.window_size[1] / 600.0, **line_colours)
+        width, height = plotter.window_size
+        cell_size = np.sqrt(width * height / (1 + facets.cell_data["cell"].max()))  # in pixels, roughly
+        faint = {"opacity": max(cell_size / FAINT, 0.2)} if cell_size < FAINT else {}
+        plotter.add_mesh(sides, lighting=False, line_width=max(height / 600.0, 2.0), **faint, **line_colours)
     return actors[0]
 
 
 def _standing_out(colours: Floats) -> npt.NDArray[np.uint8]:
     """Return colours of lines that can be seen on those given, shape (n, 3): darker, or lighter than what is dark."""
     rgb = colours[:, :3]
-    dark = (rgb @ LUMINANCE)[:, None] < 0.2
+    dark = (rgb @ LUMINANCE)[:, None] < 0.15
     return (255 * np.where(dark, 0.7 * rgb + 0.3, 0.25 * rgb)).astype(np.uint8)
 
 
@@ -369,7 +376,7 @@ def _add_bar(plotter: pyvista.Plotter, mapper: pyvista.DataSetMapper, title: str
 
 
 def _ticks(low: float, high: float) -> tuple[Floats, str]:
-    """Return some four to eight round numbers in an interval, and a format that tells them apart."""
+    """Return four to ten round numbers in an interval, and a format that tells them apart."""
     power = 10.0 ** np.floor(np.log10((high - low) / 4.0))
     step = power * max(k for k in (1.0, 2.0, 5.0) if 4.0 * k * power <= (high - low) * (1.0 + 1e-9))
     ticks = step * np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1.0) + 0.0  # no -0

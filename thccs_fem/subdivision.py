@@ -1,8 +1,8 @@
 """One Catmull-Clark step on a mesh or on a part of it: child topology and the sparse matrix S.
 
 A `Level` is a set of faces of one subdivision level in half-edge form.  Half-edge `h` belongs to one face, starts at
-`vertices[h]` and runs to the start of `following[h]`; the half-edges of face `f` are `offsets[f] .. offsets[f + 1]`.  Only
-level 0 of a mesh with polygons has faces other than quads.
+`vertices[h]` and runs to the start of `following[h]`; the half-edges of face `f` are `offsets[f] .. offsets[f + 1]`.
+Only level 0 of a mesh with polygons has faces other than quads.
 
 After one step the vertices are ordered `[old vertices | edge points | face points]`.  The child at half-edge `h` is
 `[old vertex, edge point of h, face point, edge point of the half-edge before h]`: an extraordinary vertex is always
@@ -59,8 +59,8 @@ class Level:
         twins: Opposite half-edge, or -1 on a real or an artificial rim, shape (num_half_edges,).
         keys: Identity of each face on its level whatever part of the level is held: 4 * key of the parent + child;
             ascending, shape (num_faces,), int64.
-        boundary_edge: Half-edge of the control mesh that a half-edge on the boundary of the surface descends from, -1 for
-            those inside, shape (num_half_edges,).
+        boundary_edge: Half-edge of the control mesh that a half-edge on the boundary of the surface descends from, -1
+            for those inside, shape (num_half_edges,).
         vertex_num_faces: Faces at each vertex, counted on the whole surface, shape (num_vertices,).
         boundary: Vertices on the boundary of the surface, shape (num_vertices,).
         corner: Boundary vertices that stay where they are: tagged corners and vertices of one face, (num_vertices,).
@@ -209,11 +209,7 @@ def _refuse_unsupported_sharpness(mesh: ControlMesh) -> None:
     on_boundary[mesh.boundary_vertices] = True
     boundary_edges = {(int(a), int(b)) for a, b in mesh.edges[mesh.boundary_edges]}
     creases = [edge for edge, s in mesh.creases.items() if s > 0 and edge not in boundary_edges]
-    corners = [
-        v
-        for v, s in mesh.corners.items()
-        if s > 0 and not (on_boundary[v] and s >= INFINITE_SHARPNESS)
-    ]
+    corners = [v for v, s in mesh.corners.items() if s > 0 and not (on_boundary[v] and s >= INFINITE_SHARPNESS)]
     if creases or corners:
         what = f"crease at edge {creases[0]}" if creases else f"corner at vertex {corners[0]}"
         raise NotImplementedError(
@@ -248,8 +244,8 @@ def _rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:
 def subdivided(mesh: ControlMesh, times: int = 1) -> ControlMesh:
     """Return the control mesh after some Catmull-Clark steps: all quads, with the same limit surface and tags.
 
-    The child at half-edge h of a mesh (corner h - face_offsets[f] of face f) is face h of the next one; old vertices keep
-    their numbers.
+    The child at half-edge h of a mesh (corner h - face_offsets[f] of face f) is face h of the next one; old vertices
+    keep their numbers.
 
     Args:
         mesh: The control mesh.
@@ -429,9 +425,7 @@ def _child_twins(level: Level, half_edges: Ints, child: Ints) -> Ints:
     return twins.ravel().astype(np.int32)
 
 
-def _step_matrix(
-    level: Level, chosen: Ints, half_edges: Ints, child: Ints, old: Ints, edges: Ints
-) -> sp.csr_array:
+def _step_matrix(level: Level, chosen: Ints, half_edges: Ints, child: Ints, old: Ints, edges: Ints) -> sp.csr_array:
     """Return S, shape (old + edges + chosen, coarse vertices); see `subdivide`."""
     num_vertices = level.num_vertices
     sizes = np.diff(level.offsets)[chosen]
@@ -447,9 +441,7 @@ def _step_matrix(
     return sp.csr_array(sp.vstack([vertex_rows, edge_rows, face_point], format="csr"))
 
 
-def _edge_rows(
-    level: Level, edges: Ints, child: Ints, face_number: Ints, face_point: sp.csr_array
-) -> sp.csr_array:
+def _edge_rows(level: Level, edges: Ints, child: Ints, face_number: Ints, face_point: sp.csr_array) -> sp.csr_array:
     """Edge points: mean of the ends and the two face points; midpoint on the rim."""
     twins = level.twins[edges]
     inner = np.flatnonzero((twins >= 0) & (child[twins] >= 0))
@@ -528,9 +520,9 @@ def in_sub_quads(
     Args:
         mesh: The control mesh.
         faces: Faces of the mesh, shape (n,).
-        uv: Coordinates in [0, 1]^2, shape (n, 2): of the face, u along its edge from corner 0 to 1 and v from corner 0 to
-            3; or, where `corner` names one, of the sub-quad there: (0, 0) the corner, u towards the next one, (1, 1) the
-            face point.
+        uv: Coordinates in [0, 1]^2, shape (n, 2): of the face, u along its edge from corner 0 to 1 and v from corner 0
+            to 3; or, where `corner` names one, of the sub-quad there: (0, 0) the corner, u towards the next one, (1, 1)
+            the face point.
         corner: Corner of the face, -1 for none, shape (n,); faces that are no quads need one.
 
     Returns:
@@ -572,7 +564,8 @@ def _checked_positions(
     bad = np.flatnonzero((corner >= sizes) | ((corner < 0) & (sizes != 4)))
     if bad.size:
         raise ValueError(
-            f"point {bad[0]} is on face {faces[bad[0]]} with {sizes[bad[0]]} corners and names corner {corner[bad[0]]}; "
+            f"point {bad[0]} is on face {faces[bad[0]]} with {sizes[bad[0]]} corners and names corner "
+            f"{corner[bad[0]]}; "
             f"a face that is no quad needs a corner from 0 to {sizes[bad[0]] - 1} for each of its points"
         )
     bad = np.flatnonzero(~((uv >= 0.0) & (uv <= 1.0)).all(axis=1))

@@ -66,17 +66,17 @@ def write_vtu(
     # A directory of its own: the draft gets the usual permissions, and goes away whatever happens.
     with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
         draft = Path(folder, path.name)
-        _save(grid, draft)
+        _save(grid, draft, path)
         draft.replace(path)
 
 
-def _save(grid: pyvista.UnstructuredGrid, path: Path) -> None:
-    # Not by grid.save, which does not tell when the disk is full.
+def _save(grid: pyvista.UnstructuredGrid, draft: Path, path: Path) -> None:
+    """Write the draft of a file; not by grid.save, which does not tell when the disk is full."""
     from vtkmodules.vtkCommonMisc import vtkErrorCode
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
-    writer.SetFileName(str(path))
+    writer.SetFileName(str(draft))
     writer.SetInputData(grid)
     if not writer.Write():
         reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
@@ -148,8 +148,8 @@ def _cells_and_functions(uh: object) -> tuple[Cells, list[Function]]:
     for f in functions[1:]:
         if not _same_pieces(f.function_space.hierarchy, first.hierarchy):
             raise ValueError(
-                f"the elements of {f.name!r} ({f.function_space!r}) are not those of {functions[0].name!r} ({first!r}): "
-                f"carry the coarser function over with adapt.transfer, or write two files"
+                f"the elements of {f.name!r} ({f.function_space!r}) are not those of {functions[0].name!r} "
+                f"({first!r}): carry the coarser function over with adapt.transfer, or write two files"
             )
     names = [f.name for f in functions]
     if len(set(names)) < len(names):

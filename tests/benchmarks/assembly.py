@@ -1,4 +1,7 @@
-"""Microseconds a cell for assembling a matrix on a torus of n x n cells, beside DOLFINx with cubic Lagrange elements.
+"""Microseconds a cell for assembling a matrix, beside DOLFINx with cubic Lagrange elements on a torus of n x n cells.
+
+Our cells are those of a torus, all regular, and of a sphere made of triangles, with an extraordinary vertex at every
+corner of every face, adaptively refined: there a cell has several pieces, each with an extraction operator.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/assembly.py [n]
 
@@ -20,10 +23,12 @@ from petsc4py import PETSc
 
 import dolfinx.fem.petsc
 import numpy as np
+from scipy.spatial import ConvexHull
 
 import basix.ufl
 import ufl
-from thccs_fem import fem, generators, jit
+from thccs_fem import adapt, fem, generators, jit
+from thccs_fem.mesh import ControlMesh, orient
 
 REPEATS = 7
 N = int(sys.argv[1]) if len(sys.argv) > 1 else 128
@@ -44,7 +49,22 @@ def bending(u: ufl.Argument, v: ufl.Argument) -> ufl.Form:
 FORMS = {"stiffness": stiffness, "stiffness + mass": stiffness_and_mass, "bending": bending}
 
 
-def least(action: Callable[[], object], prepare: Callable[[], object]) -> float:
+def rough_sphere(num_points: int = 2000) -> ControlMesh:
+    """Return a sphere of triangles between points on a spiral."""
+    z = 1 - (2 * np.arange(num_points) + 1) / num_points
+    turn = np.pi * (1 + 5**0.5) * np.arange(num_points)
+    points = np.column_stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z])
+    return ControlMesh(points, orient(points, ConvexHull(points).simplices))
+
+
+def refined_towards_a_circle(V: fem.FunctionSpace, steps: int = 3) -> fem.FunctionSpace:
+    """Refine the functions near the plane x = 0.3, nearer with each step."""
+    for step in range(steps):
+        V = adapt.refine(V, np.flatnonzero(np.abs(V.reference_points[:, 0] - 0.3) < 0.2 * 2.0**-step))
+    return V
+
+
+def least(action: Callable[[], object], prepare: Callable[[], object], num_cells: int) -> float:
     """Return the least CPU time of an action, in microseconds a cell."""
     times = []
     for _ in range(REPEATS):
@@ -52,14 +72,14 @@ def least(action: Callable[[], object], prepare: Callable[[], object]) -> float:
         start = time.process_time()
         action()
         times.append(time.process_time() - start)
-    return min(times) / N**2 * 1e6
+    return min(times) / num_cells * 1e6
 
 
 class Ours:
     """Splines: into scipy's CSR array, which PETSc gets without a copy."""
 
-    def __init__(self) -> None:
-        self.V = fem.functionspace(generators.torus((N, N)), ("THCCS", 3))
+    def __init__(self, V: fem.FunctionSpace) -> None:
+        self.V = V
         self.points = self.V.cells.points
         self.points.setflags(write=True)
 
@@ -81,12 +101,13 @@ class Ours:
             fem.assemble_matrix(A, form)
             mat.stateIncrease()
 
+        n = self.V.num_cells
         return {
             "ours, scipy": (
-                least(lambda: fem.assemble_matrix(fresh[0]), forget_pattern),
-                least(lambda: fem.assemble_matrix(A, form), self.change_geometry),
+                least(lambda: fem.assemble_matrix(fresh[0]), forget_pattern, n),
+                least(lambda: fem.assemble_matrix(A, form), self.change_geometry, n),
             ),
-            "ours, PETSc": (least(to_petsc, forget_pattern), least(refill_petsc, self.change_geometry)),
+            "ours, PETSc": (least(to_petsc, forget_pattern, n), least(refill_petsc, self.change_geometry, n)),
         }
 
     def change_geometry(self) -> None:
@@ -134,12 +155,12 @@ class Dolfinx:
 
         return {
             f"DOLFINx {name}, PETSc": (
-                least(first_petsc, self.change_geometry),
-                least(refill_petsc, self.change_geometry),
+                least(first_petsc, self.change_geometry, N**2),
+                least(refill_petsc, self.change_geometry, N**2),
             ),
             f"DOLFINx {name}, own CSR": (
-                least(lambda: dolfinx.fem.assemble_matrix(form), self.change_geometry),
-                least(refill_own, self.change_geometry),
+                least(lambda: dolfinx.fem.assemble_matrix(form), self.change_geometry, N**2),
+                least(refill_own, self.change_geometry, N**2),
             ),
         }
 
@@ -148,16 +169,23 @@ class Dolfinx:
 
 
 def main() -> None:
-    ours, theirs = Ours(), Dolfinx()
-    print(f"torus {N} x {N}, {N**2} cells, {ours.V.num_dofs} spline and {9 * N**2} Lagrange dofs; CPU us a cell")
-    print(f"our flags: {' '.join(jit.FLAGS)}")
+    torus = Ours(fem.functionspace(generators.torus((N, N)), ("THCCS", 3)))
+    rough = Ours(refined_towards_a_circle(fem.functionspace(rough_sphere(), ("THCCS", 3))))
+    theirs = Dolfinx()
+    print(f"torus {N} x {N}: {N**2} cells, {torus.V.num_dofs} spline and {9 * N**2} Lagrange dofs")
+    print(
+        f"rough sphere: {rough.V.num_cells} cells of {rough.V.cells.num_pieces} pieces, {rough.V.num_levels} levels, "
+        f"{rough.V.num_dofs} dofs"
+    )
+    print(f"CPU us a cell; our flags: {' '.join(jit.FLAGS)}")
     print("\n| form | matrix | first | repeated | times ours, first | repeated |")
     print("|---|---|---|---|---|---|")
     for form, make in FORMS.items():
-        rows = ours.times(make)
+        rows = torus.times(make)
+        base = rows["ours, PETSc"]
+        rows |= {f"{name}, rough sphere": times for name, times in rough.times(make).items()}
         rows |= theirs.times(make, "default flags")
         rows |= theirs.times(make, "our flags", cffi_extra_compile_args=list(jit.FLAGS))
-        base = rows["ours, PETSc"]
         for name, (first, repeated) in rows.items():
             ratios = f"{first / base[0]:.1f} | {repeated / base[1]:.1f}"
             print(f"| {form} | {name} | {first:.2f} | {repeated:.2f} | {ratios} |")

@@ -1,8 +1,8 @@
 """Strong Dirichlet conditions: which degrees of freedom, and which values.
 
-Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of a
-function, or one through `V.sub(c)`.  No spline interpolates: an expression is projected, in L2 of the boundary edges that the
-named functions alone determine, or of the cells where the functions do not live on the boundary.
+Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of
+a function, or one through `V.sub(c)`.  No spline interpolates: an expression is projected, in L2 of the boundary edges
+that the named functions determine, or of the cells if not all of them reach the boundary.
 """
 
 from __future__ import annotations
@@ -26,10 +26,13 @@ from thccs_fem.subdivision import Bools, Ints
 __all__ = ["DirichletBC", "boundary_dofs", "dirichletbc", "locate_dofs_geometrical", "region_dofs"]
 
 NONZERO = 1e-10  # extraction entries are 0 up to rounding or a good part of 1 in some piece of the cell
-NUM_GAUSS = 8  # points in each direction: exact for the mass matrix on straight pieces, far below the error of the space
+AROUND = 1e-6  # weight of a value around the part that is prescribed, against 1 in it
+RIDGE = 1e-13  # makes regular what is determined nowhere; no more than rounding elsewhere
+NUM_GAUSS = 8  # points in each direction: exact for straight pieces, far below the error of the space for others
 SIDES = np.array([[0, 1, 2, 3], [3, 7, 11, 15], [15, 14, 13, 12], [12, 8, 4, 0]])  # coefficients i + 4 j on each side
 
 Floats = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.integer]
 Marker = Callable[[Floats], npt.NDArray[np.bool_]]
 
 
@@ -103,6 +106,7 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
         Function numbers, ascending, shape (m,), local.
 
     Raises:
+        TypeError: If the faces are no integers.
         ValueError: If not just one of `faces` and `tag` is given, or a face is out of range.
     """
     if (faces is None) == (tag is None):
@@ -111,10 +115,7 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
     if faces is None:
         marked |= V.mesh.face_tags == tag
     else:
-        chosen = np.asarray(faces)
-        if chosen.size and (chosen.min() < 0 or chosen.max() >= V.mesh.num_faces):
-            raise ValueError(f"faces run from 0 to {V.mesh.num_faces - 1}; got {chosen.min()} to {chosen.max()}")
-        marked[chosen] = True
+        marked[_indices(faces, "faces", V.mesh.num_faces)] = True
     cells = V.cells
     dofs = [batch.dofs[marked[cells.face[batch.cells]]].ravel() for batch in cells.batches]
     found = np.unique(np.concatenate(dofs))
@@ -125,32 +126,37 @@ def dirichletbc(value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace 
     """Prescribe a value on functions.
 
     Args:
-        value: A number, an array of values per component (of all functions the same) or per function, a `Constant`, a UFL
-            expression, or a callable g(x) with x of shape (3, n). Expressions and callables are projected in L2.
+        value: A number, an array of values per component (of all functions the same) or per function, a `Constant`, a
+            UFL expression, or a callable g(x) with x of shape (3, n). Expressions and callables are projected in L2.
+            All are read here and now.
         dofs: Function numbers, shape (n,).
         V: The space, or one component `V.sub(c)`.
 
     Raises:
-        ValueError: If the dofs are out of range or the value's shape does not fit.
+        TypeError: If the dofs are no integers, or V is no space.
+        ValueError: If the dofs are out of range, the value's shape does not fit, or a value is not finite.
     """
     space, component = (V.space, V.component) if isinstance(V, Component) else (V, None)
-    functions = np.unique(np.asarray(dofs, dtype=np.int64))
-    if functions.size and (functions[0] < 0 or functions[-1] >= space.num_functions):
-        raise ValueError(f"dofs run from 0 to {space.num_functions - 1}; got {functions[0]} to {functions[-1]}")
+    if not isinstance(space, FunctionSpace):
+        raise TypeError(f"dirichletbc needs a space from fem.functionspace, or V.sub(c), got {type(V).__name__}")
+    dofs = _indices(dofs, "dofs", space.num_functions)
+    functions = np.unique(dofs)
     components = np.arange(space.block_size) if component is None else np.array([component])
     if isinstance(value, Constant):
         value = value.value
     if isinstance(value, ufl.core.expr.Expr) or callable(value):
         values = _projected(space, functions, value, components.size)
     else:
-        values = _broadcast(np.asarray(value, dtype=np.float64), np.asarray(dofs), functions, components.size)
+        values = _broadcast(np.array(value, dtype=np.float64), dofs, functions, components.size)
+        if not np.isfinite(values).all():
+            raise ValueError(f"the value {value!r} is not finite: prescribe finite values")
     numbers = space.block_size * functions[:, None] + components
     return DirichletBC(space, numbers.ravel().astype(np.int32), values.ravel())
 
 
-def _broadcast(value: Floats, dofs: npt.NDArray[np.integer], functions: Ints, k: int) -> Floats:
+def _broadcast(value: Floats, dofs: Indices, functions: Indices, k: int) -> Floats:
     """Return values of shape (functions, k) from one value, one a component, or one a function."""
-    if value.ndim == 0 or value.shape == (k,) and k > 1:
+    if value.ndim == 0 or (value.shape == (k,) and k > 1):
         return np.broadcast_to(value, (functions.size, k))
     if value.shape in ((dofs.size,), (dofs.size, k)):
         _, first = np.unique(dofs, return_index=True)
@@ -161,13 +167,27 @@ def _broadcast(value: Floats, dofs: npt.NDArray[np.integer], functions: Ints, k:
     )
 
 
+def _indices(given: npt.ArrayLike, name: str, size: int) -> Indices:
+    """Return numbers from 0 to size - 1 as an array."""
+    indices = np.asarray(given)
+    if not indices.size:
+        return np.zeros(0, dtype=np.int64)
+    if indices.ndim != 1 or not np.issubdtype(indices.dtype, np.integer):
+        raise TypeError(f"{name} must be integers of shape (n,), got {indices.dtype} of shape {indices.shape}")
+    if indices.min() < 0 or indices.max() >= size:
+        raise ValueError(f"{name} run from 0 to {size - 1}; got {indices.min()} to {indices.max()}")
+    return indices
+
+
 def _marked(marker: Marker, points: Floats) -> Bools:
     """Return what the marker says of points of shape (n, gdim)."""
     x = np.zeros((3, len(points)))
     x[: points.shape[1]] = points.T
     marks = np.asarray(marker(x))
     if marks.shape != (len(points),):
-        raise ValueError(f"the marker returned shape {marks.shape} for {len(points)} points; it must return ({len(points)},)")
+        raise ValueError(
+            f"the marker returned shape {marks.shape} for {len(points)} points; it must return ({len(points)},)"
+        )
     return marks.astype(bool)
 
 
@@ -184,11 +204,13 @@ def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
 
 def _points_at(cells: Cells, piece: Ints, uv: Floats) -> Floats:
     basis = element.bspline_values(uv)
-    return np.einsum("nj,ni,njic->nc", basis[:, 1], basis[:, 0], cells.piece_points[piece].reshape(piece.size, 4, 4, -1))
+    return np.einsum(
+        "nj,ni,njic->nc", basis[:, 1], basis[:, 0], cells.piece_points[piece].reshape(piece.size, 4, 4, -1)
+    )
 
 
 def _trace_rows(cells: Cells, piece: Ints, side: Ints) -> sp.csr_array:
-    """Return the Bernstein coefficients of the sides of pieces, shape (4 n, num_functions), without what is rounding."""
+    """Return the Bernstein coefficients of the sides of pieces, without rounding errors, shape (4 n, num_functions)."""
     to_bernstein = sp.kron(sp.eye_array(piece.size, format="csr"), sp.csr_array(element.TO_BERNSTEIN), format="csr")
     rows = (16 * np.arange(piece.size)[:, None] + SIDES[side]).ravel()
     trace = sp.csr_array(sp.csr_array(to_bernstein[rows] @ cells.rows(piece)))
@@ -197,83 +219,89 @@ def _trace_rows(cells: Cells, piece: Ints, side: Ints) -> sp.csr_array:
     return trace
 
 
-def _projected(V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int) -> Floats:
-    """Return the coefficients of the L2 projection of an expression on the functions, shape (functions, k)."""
+def _projected(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> Floats:
+    """Return the coefficients of the L2 projection of an expression on the functions, shape (functions, k).
+
+    What is fitted by least squares is the value on the part of the boundary or of the surface that the given functions
+    determine, together with all other functions there, and, with a small weight, the value around it: functions that
+    hardly reach into the part, or that others can stand in for there, are determined by that.
+    """
+    if not functions.size:
+        return np.zeros((0, k))
     basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
+    weights = np.where(np.isfinite(values).all(axis=1), weights, 0.0)  # around the part, it need not be defined
     weighted = sp.csr_array(sp.diags_array(weights) @ basis)
-    mass = sp.csc_array(basis.T @ weighted)
-    return spla.splu(mass).solve(np.ascontiguousarray(weighted.T @ values)).reshape(functions.size, k)
+    present = np.unique(weighted.indices)
+    mass = sp.csc_array((basis.T @ weighted)[present][:, present])
+    mass.setdiag((1.0 + RIDGE) * mass.diagonal())
+    fitted = spla.splu(mass).solve((weighted.T @ np.nan_to_num(values))[present])
+    return fitted[np.searchsorted(present, functions)]
 
 
 def _on_boundary(
-    V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int
+    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
 ) -> tuple[sp.csr_array, Floats, Floats] | None:
     """Return basis, weights and values at Gauss points of the boundary; None if a function has no trace there."""
     cells = V.cells
     piece, side, _ = cells.boundary_pieces
     trace = _trace_rows(cells, piece, side)
-    chosen = _determined(trace, functions, 4)
-    if chosen is None:
+    if not np.isin(functions, trace.indices).all():
         return None
+    chosen, is_inside = _blocks(trace, functions, 4)
     piece, side = piece[chosen], side[chosen]
     t, w = _gauss()
     start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     along = np.roll(start, -1, axis=0) - start
     points = start[:, None] + along[:, None] * t[:, None]  # (4 sides, Gauss points, 2)
     bernstein = sp.kron(sp.eye_array(piece.size), sp.csr_array(element.bernstein_values(t)), format="csr")
-    rows = sp.csr_array(trace[(4 * np.flatnonzero(chosen)[:, None] + np.arange(4)).ravel()])
+    rows = sp.csr_array(trace[(4 * chosen[:, None] + np.arange(4)).ravel()])
     control = (element.TO_BERNSTEIN @ cells.piece_points[piece])[np.arange(piece.size)[:, None], SIDES[side]]
     tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(t), control)
     weights = np.linalg.norm(tangent, axis=2) * w
     values = values_at(value, V, piece, points.reshape(-1, 2), k).reshape(piece.size, 4, t.size, k)
     values = values[np.arange(piece.size), side]
-    return sp.csr_array(bernstein @ rows[:, functions]), weights.ravel(), values.reshape(-1, k)
+    return sp.csr_array(bernstein @ rows), _weighted(weights, values, is_inside), values.reshape(-1, k)
 
 
 def _on_cells(
-    V: FunctionSpace, functions: Ints, value: ValueOrExpression, k: int
+    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
 ) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the cells that the functions determine."""
+    """Return basis, weights and values at Gauss points of the pieces that the functions live on."""
     cells = V.cells
     all_rows = cells.rows(np.arange(cells.num_pieces, dtype=np.int32))
-    chosen = _determined(all_rows, functions, 16)
-    if chosen is None:
-        raise ValueError(
-            "an expression cannot be projected on these dofs: some of them determine no boundary edge and no cell. Take "
-            "all functions of a part of the boundary (boundary_dofs) or of a region (region_dofs), or give the values as "
-            "an array"
-        )
-    piece = np.flatnonzero(chosen).astype(np.int32)
+    piece, is_inside = _blocks(all_rows, functions, 16)
     t, w = _gauss()
     points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
     basis = element.bspline_values(points)
     table = (basis[:, 1, :, None] * basis[:, 0, None, :]).reshape(-1, 16)
     rows = sp.csr_array(all_rows[(16 * piece[:, None] + np.arange(16)).ravel()])
-    at_points = sp.csr_array(sp.kron(sp.eye_array(piece.size), sp.csr_array(table), format="csr") @ rows[:, functions])
+    at_points = sp.csr_array(sp.kron(sp.eye_array(piece.size), sp.csr_array(table), format="csr") @ rows)
     weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
-    return at_points, weights.ravel(), values_at(value, V, piece, points, k).reshape(-1, k)
+    values = values_at(value, V, piece, points, k)
+    return at_points, _weighted(weights, values, is_inside), values.reshape(-1, k)
 
 
-def _determined(rows: sp.csr_array, functions: Ints, height: int) -> Bools | None:
-    """Return the blocks of `height` rows in which only the given functions occur.
-
-    Functions that occur in no such block add every block they occur in. None if one occurs in none at all.
-    """
+def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
+    """Return the blocks of `height` rows where given functions occur, and in which of these no others do."""
     given = np.zeros(rows.shape[1], dtype=bool)
     given[functions] = True
     block = np.repeat(np.arange(rows.shape[0]) // height, np.diff(rows.indptr))
-    foreign = np.zeros(rows.shape[0] // height, dtype=bool)
-    foreign[block[~given[rows.indices]]] = True
-    present = np.zeros(rows.shape[1], dtype=bool)
-    present[rows.indices] = True
-    if not present[functions].all():
-        return None
-    covered = np.zeros(rows.shape[1], dtype=bool)
-    covered[rows.indices[~foreign[block]]] = True
-    lonely = given & ~covered
-    chosen = ~foreign
-    chosen[block[lonely[rows.indices]]] = True
-    return chosen
+    num_given, num_foreign = (
+        np.bincount(block, weights=marks[rows.indices], minlength=rows.shape[0] // height) for marks in (given, ~given)
+    )
+    chosen = np.flatnonzero(num_given).astype(np.int32)
+    return chosen, num_foreign[chosen] == 0
+
+
+def _weighted(weights: Floats, values: Floats, is_inside: Bools) -> Floats:
+    """Return the weights of shape (n, points), made small outside, in one row."""
+    bad = ~np.isfinite(values).all(axis=(1, 2)) & is_inside
+    if bad.any():
+        raise ValueError(
+            f"the value is not finite on {np.count_nonzero(bad)} of the {np.count_nonzero(is_inside)} edges or patches "
+            f"of surface that the dofs determine: prescribe finite values"
+        )
+    return (weights * np.where(is_inside, 1.0, AROUND)[:, None]).ravel()
 
 
 def _gauss() -> tuple[Floats, Floats]:

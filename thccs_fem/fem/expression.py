@@ -114,6 +114,7 @@ def values_at(value: ValueOrExpression, V: FunctionSpace, pieces: Ints, points: 
     values = np.asarray(value(x), dtype=np.float64)
     if values.shape not in ((piece.size,), (k, piece.size)):
         raise ValueError(
-            f"g(x) returned shape {values.shape} for x of shape {x.shape}; it must return ({piece.size},) or ({k}, {piece.size})"
+            f"g(x) returned shape {values.shape} for x of shape {x.shape}; it must return ({piece.size},) or ({k}, "
+            f"{piece.size})"
         )
     return np.ascontiguousarray(np.broadcast_to(values, (k, piece.size)).T).reshape(pieces.size, len(points), k)

@@ -42,14 +42,14 @@ class Function(ufl.Coefficient):
     def __init__(self, V: FunctionSpace, name: str = "f"):
         if not isinstance(V, FunctionSpace):
             raise TypeError(f"a Function needs a space from fem.functionspace, got {type(V).__name__}")
-        super().__init__(V)
+        super().__init__(V)  # type: ignore[no-untyped-call]  # UFL is typed in part
         self.name = name
         self._x = Vector(V.num_dofs)
 
     @property
     def function_space(self) -> FunctionSpace:
         """The space."""
-        return self.ufl_function_space()
+        return self.ufl_function_space()  # type: ignore[no-untyped-call]  # as above
 
     @property
     def x(self) -> Vector:
@@ -102,7 +102,7 @@ class Constant(ufl.Constant):
 
     def __init__(self, domain: ControlMesh, c: npt.ArrayLike):
         self._value = np.array(c, dtype=np.float64)
-        super().__init__(domain.ufl_domain(), self._value.shape)
+        super().__init__(domain.ufl_domain(), self._value.shape)  # type: ignore[no-untyped-call]  # as above
 
     @property
     def value(self) -> Any:

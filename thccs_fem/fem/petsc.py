@@ -192,9 +192,9 @@ class LinearProblem:
     Where constants are in the kernel of a, as on a closed surface without conditions, u is the solution with mean zero.
 
     Options are those in `petsc_options`, and those on the command line (and in PETSc's other sources) with the prefix.
-    If neither says what ``ksp_type`` or ``pc_type`` is, systems with up to `LARGEST_DIRECT` dofs are factorised by
-    MUMPS, and larger ones solved by conjugate gradients, or GMRES where the matrix is not symmetric, with algebraic
-    multigrid. ``ksp_rtol`` is `TOLERANCE` by default.
+    If neither says what ``ksp_type`` or ``pc_type`` is, systems with up to `LARGEST_DIRECT` dofs are factorised (by
+    MUMPS, if PETSc has it), and larger ones solved by conjugate gradients, or GMRES where the matrix is not symmetric,
+    with algebraic multigrid. ``ksp_rtol`` is `TOLERANCE` by default.
 
     Args:
         a: Bilinear form.
@@ -229,7 +229,7 @@ class LinearProblem:
             raise ValueError('petsc_options_prefix is empty: give a name that is the problem\'s own, as "poisson_"')
         self._system = LinearSystem(a, L, bcs=bcs, u=u)
         self.bcs = bcs
-        self._options = dict(petsc_options or {})
+        self._options = {name.removeprefix("-"): value for name, value in (petsc_options or {}).items()}
         self._unused = set(self._options)
         self._comm = _comm(self.u.function_space)
         self._solver = PETSc.KSP().create(self._comm)
@@ -307,7 +307,8 @@ class LinearProblem:
             if self._system.b.size <= LARGEST_DIRECT:
                 self._solver.setType("preonly")
                 pc.setType("cholesky" if symmetric else "lu")
-                pc.setFactorSolverType("mumps")
+                if PETSc.Sys.hasExternalPackage("mumps"):
+                    pc.setFactorSolverType("mumps")
             else:
                 self._solver.setType("cg" if symmetric else "gmres")
                 pc.setType("gamg")
@@ -331,7 +332,7 @@ class LinearProblem:
         """Raise if there is no solution."""
         solver, pc = self._solver, self._solver.getPC()
         name = f"PETSc's {solver.getType()} with the preconditioner {pc.getType()}"
-        reason = int(solver.getConvergedReason())
+        reason: Any = solver.getConvergedReason()  # an int, other than the stubs say
         if reason <= 0:
             why = REASONS.get(reason, str(reason))
             raise RuntimeError(
@@ -341,7 +342,8 @@ class LinearProblem:
             )
         if self._factorises:
             check_regular(self._system.A, lambda r: _solved(pc.getFactorMatrix(), r))
-        if solver.getType() == "preonly" or not np.isfinite(x).all():
+        # "Converged by iterations" means that nobody looked.
+        if reason == PETSc.KSP.ConvergedReason.CONVERGED_ITS or not np.isfinite(x).all():
             check_residual(self._system.A, x, self._system.b, name)
 
 

@@ -19,7 +19,7 @@ __all__ = ["project"]
 
 Floats = npt.NDArray[np.float64]
 
-DEGREE = 11  # of the quadrature for g(x): 6 x 6 points
+DEGREE = 11  # of the quadrature, 6 x 6 points: the same on both sides, so that functions of V stay what they are
 TOLERANCE = 1e-13  # mass matrices are scaled by their diagonal: 100 to 300 iterations on any mesh and refinement
 
 
@@ -41,7 +41,9 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
     else:
         load = _load(_as_ufl(value), V)
     scalar = FunctionSpace(V.hierarchy)
-    mass = assemble_matrix(form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx))
+    mass = assemble_matrix(
+        form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
+    )
     projection = Function(V)
     components = [conjugate_gradients(mass, b, TOLERANCE) for b in load.T]
     projection.x.array = np.stack(components, axis=1).ravel()
@@ -66,7 +68,9 @@ def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
         raise ValueError(
             f"a value of shape {value.ufl_shape} cannot be projected on functions of shape {V.value_shape}"
         )
-    return assemble_vector(form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx)).reshape(-1, V.block_size)
+    return assemble_vector(form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx, quadrature_degree=DEGREE)).reshape(
+        -1, V.block_size
+    )
 
 
 def _load_at_points(value: ValueOrExpression, V: FunctionSpace) -> Floats:

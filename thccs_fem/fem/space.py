@@ -1,7 +1,7 @@
 """Function spaces on the limit surface of a control mesh.
 
-A `FunctionSpace` is a UFL function space whose functions are the active functions of a `Hierarchy`, once for every component
-of the value.  Degree of freedom `block_size * i + c` is component c of function i.
+A `FunctionSpace` is a UFL function space whose functions are the active functions of a `Hierarchy`, once for every
+component of the value.  Degree of freedom `block_size * i + c` is component c of function i.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ class FunctionSpace(ufl.FunctionSpace):
     """
 
     def __init__(self, hierarchy: Hierarchy, value_shape: tuple[int, ...] = ()):
-        super().__init__(hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline())
+        super().__init__(  # type: ignore[no-untyped-call]  # UFL is typed in part
+            hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline()
+        )
         self.hierarchy = hierarchy
         self.block_size = int(np.prod(value_shape, dtype=int))
 
@@ -128,7 +130,7 @@ class FunctionSpace(ufl.FunctionSpace):
     def __hash__(self) -> int:
         return hash((id(self.mesh), self.hierarchy.rule, self.num_dofs, self.value_shape))
 
-    def __repr__(self) -> str:
+    def __str__(self) -> str:
         return (
             f"FunctionSpace(THCCS degree 3, values {self.value_shape}, {self.hierarchy.rule} boundary, "
             f"{self.num_levels} levels, {self.num_dofs} dofs)"
@@ -155,7 +157,8 @@ def functionspace(
     Args:
         mesh: The control mesh.
         element: ("THCCS", 3) for scalars, ("THCCS", 3, (k,)) for vectors with k components.
-        boundary: "clamped" (full approximation order up to the boundary) or "crease" (the plain Catmull-Clark boundary).
+        boundary: "clamped" (full approximation order up to the boundary) or "crease" (the plain Catmull-Clark
+        boundary).
         cap_level: Level at which a bicubic cap ends the cut at extraordinary vertices; deeper where refinement goes
             deeper.
 
@@ -180,7 +183,7 @@ def functionspace(
     return space
 
 
-def _value_shape(element: tuple[Any, ...]) -> tuple[int, ...]:
+def _value_shape(element: object) -> tuple[int, ...]:
     """Return the value shape that ("THCCS", 3[, shape]) asks for."""
     if not isinstance(element, tuple) or not 2 <= len(element) <= 3 or element[:2] != (FAMILY, DEGREE):
         raise ValueError(f'the element is {element!r}; it must be ("THCCS", 3), or ("THCCS", 3, (k,)) for k components')

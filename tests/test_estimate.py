@@ -1,0 +1,178 @@
+"""Error indicators against closed forms, quadrature by hand and what they must vanish on."""
+
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from problems import errors, poisson, projected_in_h1, randomly_refined, smooth, uniformly_refined, wavy
+
+import ufl
+from thccs_fem import estimate, fem, generators
+from thccs_fem.extraction import evaluate_pieces
+from ufl import div, grad
+
+Floats = npt.NDArray[np.float64]
+Make = Callable[[], fem.FunctionSpace]
+
+
+def planar(times: int = 2) -> fem.FunctionSpace:
+    return randomly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3)), times)
+
+
+def on_surface(times: int = 2) -> fem.FunctionSpace:
+    return randomly_refined(fem.functionspace(generators.cube_sphere(2), ("THCCS", 3)), times)
+
+
+SPACES = {"planar": planar, "on a surface": on_surface}
+each_space = pytest.mark.parametrize("make", SPACES.values(), ids=SPACES)
+
+
+def with_random_values(V: fem.FunctionSpace, seed: int = 0) -> fem.Function:
+    function = fem.Function(V)
+    function.x.array = np.random.default_rng(seed).standard_normal(V.num_dofs)
+    return function
+
+
+def coordinate(V: fem.FunctionSpace) -> fem.Function:
+    """Return the function that is the first coordinate, which every space holds."""
+    return projected_in_h1(V, ufl.SpatialCoordinate(V.mesh)[0])
+
+
+# ---- The exact error
+
+
+def test_error_of_a_constant_is_the_root_of_the_area() -> None:
+    V = fem.functionspace(generators.rectangle((4, 2)), ("THCCS", 3))
+    eta = estimate.error(fem.Function(V), ufl.as_ufl(2.0))
+    np.testing.assert_allclose(eta, 2.0 * np.sqrt(1 / 8), rtol=1e-14)
+    assert estimate.norm(V, eta) == pytest.approx(2.0, rel=1e-14)
+
+
+def test_error_of_a_polynomial() -> None:
+    V = fem.functionspace(generators.rectangle((1, 2)), ("THCCS", 3))
+    x = ufl.SpatialCoordinate(V.mesh)
+    eta = estimate.error(fem.Function(V), x[0] ** 2 * x[1])  # int x^4 = 1/5; int y^2 = 1/24 and 7/24
+    np.testing.assert_allclose(eta**2, [1 / 120, 7 / 120], rtol=1e-13)
+    eta = estimate.error(fem.Function(V), x[0] ** 2 * x[1], "H1")  # gradient (2 x y, x^2)
+    np.testing.assert_allclose(eta**2, [1 / 120 + 4 / 72 + 1 / 10, 7 / 120 + 28 / 72 + 1 / 10], rtol=1e-13)
+
+
+def test_exact_solution_may_be_a_function_of_the_coordinate() -> None:
+    V = planar()
+    uh = with_random_values(V)
+    expected = estimate.error(uh, wavy(ufl.SpatialCoordinate(V.mesh)), "H1")
+    np.testing.assert_array_equal(estimate.error(uh, wavy, "H1"), expected)
+
+
+@each_space
+def test_error_in_l2_by_hand(make: Make) -> None:
+    V = make()
+    uh = with_random_values(V)
+    points, weights = gauss(6)
+    pieces = np.arange(V.cells.num_pieces)
+    at = np.repeat(pieces, len(points)), np.tile(points, (pieces.size, 1))
+    x = evaluate_pieces(V.cells.piece_points, *at).T
+    difference = evaluate_pieces(uh.local_coefficients(), *at)[:, 0] - np.cos(x[0]) * x[1]
+    squares = difference.reshape(pieces.size, -1) ** 2 * V.cells.area_element(pieces, points) @ weights
+    expected = np.sqrt(np.bincount(V.cells.piece_cell, weights=squares))
+    actual = estimate.error(uh, lambda x: ufl.cos(x[0]) * x[1])
+    np.testing.assert_allclose(actual, expected, rtol=1e-12)  # the same points: rounding
+
+
+def gauss(n: int) -> tuple[Floats, Floats]:
+    """Return Gauss points of the reference square, shape (n * n, 2), and their weights."""
+    t, w = np.polynomial.legendre.leggauss(n)
+    x, y = np.meshgrid((t + 1) / 2, (t + 1) / 2)
+    return np.column_stack([x.ravel(), y.ravel()]), np.outer(w, w).ravel() / 4
+
+
+@each_space
+@pytest.mark.parametrize("norm", ["L2", "H1"])
+def test_error_of_what_the_space_holds_is_zero(make: Make, norm: str) -> None:
+    """On a surface as well, where UFL's gradient of x[0] has a normal part that no function on the surface has."""
+    V = make()
+    assert estimate.norm(V, estimate.error(coordinate(V), lambda x: x[0], norm)) < 1e-12
+
+
+@pytest.mark.parametrize("norm", ["L2", "H1"])
+def test_errors_add_up_over_components(norm: str) -> None:
+    V = on_surface(times=1)
+    W = fem.functionspace(V.mesh, ("THCCS", 3, (2,))).with_hierarchy(V.hierarchy)
+    u, v, w = with_random_values(V, 1), with_random_values(V, 2), fem.Function(W)
+    w.x.array = np.column_stack([u.x.array, v.x.array]).ravel()
+    x = ufl.SpatialCoordinate(V.mesh)
+    one, other = smooth(x), ufl.sin(x[2])
+    expected = np.hypot(estimate.error(u, one, norm), estimate.error(v, other, norm))
+    np.testing.assert_allclose(estimate.error(w, ufl.as_vector([one, other]), norm), expected, rtol=1e-12)
+
+
+def test_error_against_a_function_of_a_coarser_space_is_on_the_cells_of_uh() -> None:
+    coarse = planar(times=0)
+    fine = randomly_refined(coarse, times=2)
+    exact = with_random_values(coarse)
+    eta = estimate.error(fem.Function(fine), exact)
+    assert eta.shape == (fine.num_cells,)
+    assert estimate.norm(fine, eta) == pytest.approx(estimate.norm(coarse, estimate.error(exact, ufl.as_ufl(0.0))))
+
+
+def test_error_against_a_function_of_a_finer_space_is_refused() -> None:
+    coarse = planar(times=0)
+    with pytest.raises(ValueError, match="functions on a refinement of the cells that indicators are wanted for"):
+        estimate.error(fem.Function(coarse), with_random_values(randomly_refined(coarse)))
+
+
+def test_unknown_norm_is_named() -> None:
+    with pytest.raises(ValueError, match="norm is 'H2'; it must be"):
+        estimate.error(fem.Function(planar(times=0)), wavy, "H2")
+
+
+def test_norm_is_the_root_of_the_sum_of_squares() -> None:
+    assert estimate.norm(planar(times=0), np.array([3.0, 0.0, 4.0])) == 5.0
+
+
+# ---- The residual
+
+
+def test_residual_is_the_root_of_the_area_times_the_norm() -> None:
+    V = fem.functionspace(generators.rectangle((4, 2)), ("THCCS", 3))
+    eta = estimate.residual(fem.Function(V), fem.Constant(V.mesh, 3.0))  # h = sqrt(1/8), |f| = 3 sqrt(1/8)
+    np.testing.assert_allclose(eta, 3 / 8, rtol=1e-14)
+
+
+@each_space
+def test_residual_of_a_solution_in_the_space_is_zero(make: Make) -> None:
+    """A linear function in the plane; a constant on a surface, where linear ones are not harmonic."""
+    V = make()
+    x = ufl.SpatialCoordinate(V.mesh)
+    uh = projected_in_h1(V, 1 + 2 * x[0] - 3 * x[1] if V.mesh.gdim == 2 else fem.Constant(V.mesh, 1.0))
+    assert estimate.norm(V, estimate.residual(uh, div(grad(uh)))) < 1e-10  # rounding times 1/h in pieces of side 1/50
+
+
+def test_residual_sees_what_is_missing() -> None:
+    V = planar()
+    uh = fem.Function(V)
+    x = ufl.SpatialCoordinate(V.mesh)
+    eta = estimate.residual(uh, x[0] + div(grad(uh)))
+    areas = estimate.error(uh, ufl.as_ufl(1.0)) ** 2
+    np.testing.assert_allclose(eta, np.sqrt(areas) * estimate.error(uh, x[0]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("valence", [4, 5, 8])
+def test_residual_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
+    V = fem.functionspace(generators.wheel(valence, 2), ("THCCS", 3))
+    exact = wavy(ufl.SpatialCoordinate(V.mesh))
+    effectivities = []
+    for _ in range(4):
+        V = uniformly_refined(V)
+        uh = poisson(V, exact, 6.25 * exact)
+        estimated = estimate.norm(V, estimate.residual(uh, 6.25 * exact + div(grad(uh))))
+        effectivities.append(estimated / errors(uh, exact)[1])
+    assert 5.0 < min(effectivities)
+    assert max(effectivities) < 10.0  # 6.5 on regular meshes, 7.8 and 9.8 at valences 5 and 8
+
+
+def test_neumann_is_refused() -> None:
+    uh = fem.Function(planar(times=0))
+    with pytest.raises(NotImplementedError, match="boundary integrals are not supported yet"):
+        estimate.residual(uh, div(grad(uh)), neumann=ufl.as_ufl(1.0))
