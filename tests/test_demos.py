@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-DEMOS = sorted((Path(__file__).parents[1] / "demos").glob("*.py"))
+DEMOS = sorted((Path(__file__).parents[1] / "demos").rglob("*.py"))
 each_demo = pytest.mark.parametrize("demo", DEMOS, ids=lambda demo: demo.stem)
 
 

@@ -30,12 +30,6 @@ NESTED = 1e-11  # a few levels of them
 INDEPENDENT = 1e-4  # least scaled eigenvalue of the mass matrix: 4.9e-4 at the worst of 1500, 1e-15 if dependent
 
 
-def evaluated(hierarchy, u, positions):
-    cells = extract(hierarchy)
-    piece, uv = cells.locate(*positions)
-    return evaluate_pieces(cells.local(u), piece, uv)
-
-
 @pytest.mark.parametrize(("name", "rule"), CASES)
 @settings(max_examples=3)
 @given(steps=STEPS)
@@ -83,13 +77,15 @@ def test_faces_with_four_corners_of_valence_3_are_never_all_that_is_left_of_leve
 @given(steps=STEPS)
 def test_spaces_are_nested(name, rule, steps):
     hierarchies = refinements(name, rule, steps)
-    coarse, middle, fine = hierarchies[0], hierarchies[len(hierarchies) // 2], hierarchies[-1]
-    positions = random_positions(coarse, 300)
-    for one, other in ((coarse, middle), (middle, fine)):
-        prolongation = other.prolongation(one)
+    coarse, middle, fine = chosen = hierarchies[0], hierarchies[len(hierarchies) // 2], hierarchies[-1]
+    cells = [extract(hierarchy) for hierarchy in chosen]
+    places = [c.locate(*random_positions(coarse, 300)) for c in cells]
+    for k in (0, 1):
+        prolongation = chosen[k + 1].prolongation(chosen[k])
         assert abs(prolongation.sum(axis=1) - 1.0).max() < EXACT
-        u = random_vector(one.num_dofs)
-        before, after = (evaluated(h, x, positions) for h, x in ((one, u), (other, prolongation @ u)))
+        u = random_vector(chosen[k].num_dofs)
+        before = evaluate_pieces(cells[k].local(u), *places[k])
+        after = evaluate_pieces(cells[k + 1].local(prolongation @ u), *places[k + 1])
         np.testing.assert_allclose(after, before, rtol=0, atol=NESTED)
     composed = fine.prolongation(middle) @ middle.prolongation(coarse)
     np.testing.assert_allclose(composed.toarray(), fine.prolongation(coarse).toarray(), rtol=0, atol=EXACT)
@@ -211,14 +207,12 @@ def test_away_from_caps_the_pieces_are_the_limit_surface(name):
         whole = np.flatnonzero(piece_of_face >= 0)
         capped[piece_of_face[whole]] = ~stage.level.regular[stage.level.quads[whole]].all(axis=1)
     smooth = ~capped[piece]
-    assert np.count_nonzero(smooth) > 250
+    assert np.count_nonzero(smooth) > 250  # a cap of level 4 is 1/256 of a face
     found = evaluate_pieces(cells.piece_points, piece, uv)
     exact = limit.evaluate(MESHES[name], *positions[:2], corner=positions[2], derivatives=0)
     exact = np.asarray(exact).reshape(found.shape)
     size = np.ptp(MESHES[name].vertices, axis=0).max()
     np.testing.assert_allclose(found[smooth], exact[smooth], rtol=0, atol=EXACT * size)
-    # A cap at level 4 is a quarter of a thousandth of the face; it deviates by less than 3 % of its own size.
-    np.testing.assert_allclose(found, exact, rtol=0, atol=0.03 * size / 2**4)
 
 
 @pytest.mark.parametrize("name", ["grid", "tripod", "wheel5"])

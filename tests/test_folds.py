@@ -90,9 +90,9 @@ def test_faces_that_fold_are_named():
 
 def test_a_few_faces_are_named_and_all_counted():
     strip = with_a_dart()
-    num = strip.num_vertices
-    points = np.vstack([strip.vertices + [0.0, 10.0 * k] for k in range(10)])
-    mesh = ControlMesh(points, np.vstack([strip.quads + num * k for k in range(10)]))
+    places = np.array([[0.0, 10.0 * k] for k in range(10)])
+    points = (strip.vertices + places[:, None]).reshape(-1, 2)
+    mesh = ControlMesh(points, np.vstack([strip.quads + strip.num_vertices * k for k in range(10)]))
     assert re.search(r"on 10 of 30 faces, first \[2, 5, 8, 11, 14, 17, 20, 23\]: ", message(mesh))
 
 

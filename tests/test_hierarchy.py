@@ -1,4 +1,4 @@
-"""Which functions there are, and what they are in terms of each level: against definitions, a slow oracle and THB-splines."""
+"""Which functions there are, and what they are in terms of each level: definitions, a slow oracle, THB-splines."""
 
 import functools
 import itertools
@@ -213,7 +213,7 @@ def refined_in_the_middle(seed: int) -> tuple[Hierarchy, list[set[tuple[int, int
     return hierarchy, omegas
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_grid_gives_truncated_hierarchical_b_splines(seed):
     hierarchy, omegas = refined_in_the_middle(seed)
     domains = [set(itertools.product(range(GRID), range(GRID)))]
@@ -221,7 +221,7 @@ def test_a_grid_gives_truncated_hierarchical_b_splines(seed):
     every = [set(itertools.product(range(2, 2**l * GRID - 1), repeat=2)) for l in range(len(domains))]
     selected = [{f for f in e if faces_of(f) <= domain} for e, domain in zip(every, domains, strict=True)]
     cells = extract(hierarchy)
-    points = np.random.default_rng(seed).uniform(GRID / 2 - 4.0, GRID / 2 + 4.0, (400, 2))
+    points = np.random.default_rng(seed).uniform(GRID / 2 - 4.0, GRID / 2 + 4.0, (200, 2))
     low = np.floor(points).astype(int)
     piece, uv = cells.locate(low[:, 1] * GRID + low[:, 0], points - low)
     values = evaluate_pieces(cells.local(np.eye(hierarchy.num_dofs)), piece, uv)

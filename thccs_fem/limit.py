@@ -387,7 +387,8 @@ def _corner_mask(n: Ints, direction: Ints, i: Indices) -> tuple[Floats, Floats]:
 
 def _edge_weight(theta: Floats) -> Floats:
     """Return a = 16 lambda - 4, the weight of edges relative to faces."""
-    return 1.0 + np.cos(theta) + np.cos(theta / 2.0) * np.sqrt(2.0 * (9.0 + np.cos(theta)))
+    cos = np.cos(theta)
+    return np.asarray(1.0 + cos + np.cos(theta / 2.0) * np.sqrt(2.0 * (9.0 + cos)))
 
 
 def _squared_length(n: Ints, theta: Floats, a: Floats) -> Floats:

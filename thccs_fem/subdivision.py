@@ -543,6 +543,8 @@ def in_quads(
 ) -> tuple[Ints, npt.NDArray[np.float64]]:
     """Return the face and the coordinates of points in faces that are quads; arguments as for `in_sub_quads`."""
     faces, uv, corner = _checked_positions(mesh, faces, uv, corner)
+    if (corner < 0).all():
+        return faces, uv
     outer = CHILD_ORIGIN[corner] + np.einsum("nij,nj->ni", CHILD_AXES[corner], uv) / 2.0
     return faces, np.where((corner < 0)[:, None], uv, outer)
 
@@ -552,9 +554,11 @@ def _checked_positions(
 ) -> tuple[Ints, npt.NDArray[np.float64], Ints]:
     faces = np.atleast_1d(np.asarray(faces))
     uv = np.asarray(uv, dtype=np.float64)
-    corner = np.full(faces.shape, -1) if corner is None else np.broadcast_to(corner, faces.shape)
+    corner = np.full(faces.shape, -1) if corner is None else np.asarray(corner)
     if not np.issubdtype(faces.dtype, np.integer) or not np.issubdtype(corner.dtype, np.integer):
         raise TypeError(f"faces and corner must be integers, got {faces.dtype} and {corner.dtype}")
+    if corner.shape != faces.shape:
+        raise ValueError(f"corner must have shape {faces.shape}, one for each of the faces; got {corner.shape}")
     if uv.shape != (*faces.shape, 2) or faces.ndim != 1:
         raise ValueError(f"uv must have shape ({faces.size}, 2), two coordinates for each of the faces; got {uv.shape}")
     bad = np.flatnonzero((faces < 0) | (faces >= mesh.num_faces))

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse import csgraph
+from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 
 import ufl
 from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
@@ -24,6 +25,7 @@ from thccs_fem.fem.bcs import DirichletBC
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.subdivision import Bools, Ints
 
 __all__ = [
     "Constants",
@@ -32,14 +34,16 @@ __all__ = [
     "check_residual",
     "constrain",
     "constraints",
+    "drops_constants",
     "is_symmetric",
     "unfixed_constants",
 ]
 
 Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
-ROUNDING = 1e-11  # of entries, relative to those of their row; fourth-order forms on curved cells come to 1e-13
+SYMMETRIC = 1e-11  # difference of two entries, relative to the largest one
+VANISHING = 1e-13  # sum of a row, relative to that of absolute values; second-order forms come to 3e-15
+PRESCRIBED = 1e-6  # the same, where but for prescribed values it is zero by the form; fourth-order ones come to 1e-10
 INCOMPATIBLE = 1e-6  # mean of a load, relative to that of its absolute value; less is left by quadrature
 LARGEST_CONDITION = 1e12  # of a scaled matrix; singular ones come to 1e13 and more, fine fourth-order ones to 1e8
 
@@ -84,6 +88,7 @@ class LinearSystem:
         self.bcs = bcs
         self.b = np.zeros(V.num_dofs)
         self.constants: Constants | None = None
+        self._drops_constants = drops_constants(self.a)
         self._dofs, self._values = constraints(bcs, V)
         self._A: sp.csr_array | None = None
 
@@ -115,7 +120,7 @@ class LinearSystem:
             self.b[self._dofs] = self._values
             constrain(self._A, self._dofs)
         is_fixed = self._dofs.size > 0 and V.block_size == V.mesh.num_components == 1
-        self.constants = None if is_fixed else unfixed_constants(self._A, V)
+        self.constants = None if is_fixed else unfixed_constants(self._A, V, self._drops_constants)
         if self.constants is not None:
             self.b[:] = self.constants.cleared(self.b)
 
@@ -251,11 +256,30 @@ class Constants:
         return sp.csr_array((data, A.indices, A.indptr), shape=A.shape)
 
 
-def unfixed_constants(A: sp.csr_array, V: FunctionSpace) -> Constants | None:
-    """Return the constants in the kernel of a matrix on V, and of its transpose; None if there are none."""
+def drops_constants(a: Form) -> Bools:
+    """Return for each component whether a bilinear form is zero for constants, on both sides, by its symbols alone.
+
+    Rounding cannot hide that, other than in the matrix: fourth-order forms have entries of any size.
+    """
+    lowered = apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(a.ufl_form))
+    k = a.spaces[1].block_size
+    constants = [ufl.as_vector(unit.tolist()) for unit in np.eye(k)] if a.spaces[1].value_shape else [ufl.as_ufl(1.0)]
+    zero = [[ufl.replace(lowered, {u: c}).empty() for u in lowered.arguments()] for c in constants]
+    return np.array(zero).all(axis=1)
+
+
+def unfixed_constants(A: sp.csr_array, V: FunctionSpace, dropped: Bools) -> Constants | None:
+    """Return the constants in the kernel of a matrix, and of its transpose; None if there are none.
+
+    Args:
+        A: A matrix on V, with conditions.
+        V: The space.
+        dropped: What `drops_constants` says of the form.
+    """
     k = V.block_size
     ones = np.tile(np.eye(k), (V.num_functions, 1))
-    vanishing = _vanishing(A, ones) & _vanishing(A.T, ones)
+    tolerance = np.where(dropped, PRESCRIBED, VANISHING)
+    vanishing = _vanishing(A, ones, tolerance) & _vanishing(A.T, ones, tolerance)
     if not vanishing.any(axis=0).any():
         return None
     part = np.zeros(V.num_functions, dtype=np.int32)
@@ -271,9 +295,9 @@ def unfixed_constants(A: sp.csr_array, V: FunctionSpace) -> Constants | None:
     return Constants(number[part].ravel(), _integrals(V))
 
 
-def _vanishing(A: Any, ones: Floats) -> npt.NDArray[np.bool_]:
+def _vanishing(A: Any, ones: Floats, tolerance: Floats) -> Bools:
     """Return where A @ ones is but rounding."""
-    return np.abs(A @ ones) <= ROUNDING * (abs(A) @ np.ones(A.shape[1]))[:, None]
+    return np.abs(A @ ones) <= tolerance * (abs(A) @ np.ones(A.shape[1]))[:, None]
 
 
 def _integrals(V: FunctionSpace) -> Floats:
@@ -286,7 +310,7 @@ def _integrals(V: FunctionSpace) -> Floats:
 
 def is_symmetric(A: sp.csr_array) -> bool:
     """Return whether a matrix is symmetric up to rounding."""
-    return bool(abs(A - A.T).max() <= ROUNDING * abs(A).max())
+    return bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
 
 
 def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:
