@@ -13,11 +13,10 @@ from problems import poisson, randomly_refined, uniformly_refined, wavy
 
 import ufl
 from thccs_fem import adapt, estimate, fem, generators
-from thccs_fem.fem.space import FunctionSpace
 
 Floats = npt.NDArray[np.float64]
 
-SPACES: dict[str, Callable[[], FunctionSpace]] = {
+SPACES: dict[str, Callable[[], fem.FunctionSpace]] = {
     "grid": lambda: fem.functionspace(generators.rectangle((4, 3)), ("THCCS", 3)),
     "grid, crease": lambda: fem.functionspace(generators.rectangle((4, 3)), ("THCCS", 3), boundary="crease"),
     "refined wheel": lambda: randomly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3)), times=3),
@@ -28,7 +27,7 @@ some_space = st.sampled_from(list(SPACES))
 
 
 @cache
-def space(name: str) -> FunctionSpace:
+def space(name: str) -> fem.FunctionSpace:
     return SPACES[name]()
 
 
@@ -123,7 +122,7 @@ def test_nothing_is_marked_where_nothing_is_wrong(name: str, strategy: adapt.Str
 
 def test_functions_not_components_are_marked() -> None:
     scalar = space("grid")
-    V = FunctionSpace(scalar.hierarchy, (2,))
+    V = fem.FunctionSpace(scalar.hierarchy, (2,))
     eta = np.arange(V.num_cells, dtype=float)
     np.testing.assert_array_equal(adapt.mark(V, eta), adapt.mark(scalar, eta))
 
@@ -186,7 +185,7 @@ def test_the_cells_of_a_function_are_refined(name: str) -> None:
         assert {before[cell] for cell in set(range(V.num_cells)) - supports(name)[i]} <= left
 
 
-def keys(V: FunctionSpace) -> list[int]:
+def keys(V: fem.FunctionSpace) -> list[int]:
     """Return a number for each cell by which it is known on its level in all hierarchies of the mesh."""
     levels = [stage.level for stage in V.hierarchy.stages]
     return [int(levels[l].keys[f]) for l, f in zip(V.cells.level, V.cells.level_face, strict=True)]
@@ -204,7 +203,7 @@ def test_refining_all_functions_refines_all_cells() -> None:
 
 
 def test_a_vector_valued_space_stays_one() -> None:
-    V = FunctionSpace(space("grid").hierarchy, (2,))
+    V = fem.FunctionSpace(space("grid").hierarchy, (2,))
     fine = adapt.refine(V, [0])
     assert fine.value_shape == (2,)
     assert fine.num_functions == adapt.refine(space("grid"), [0]).num_functions
@@ -227,10 +226,17 @@ def test_marks_are_numbers_of_functions(marked: npt.ArrayLike) -> None:
 # ---- Transfer
 
 
-def with_random_values(V: FunctionSpace) -> fem.Function:
+def with_random_values(V: fem.FunctionSpace) -> fem.Function:
     u = fem.Function(V, name="v")
     u.x.array = np.random.default_rng(0).uniform(-1.0, 1.0, V.num_dofs)
     return u
+
+
+def largest_difference(u: fem.Function, v: fem.Function) -> float:
+    """Return the largest difference at random points, each function evaluated on its own cells."""
+    rng = np.random.default_rng(1)
+    faces, uv = rng.integers(0, u.function_space.mesh.num_faces, 3000), rng.random((3000, 2))
+    return float(np.abs(u.eval(faces, uv) - v.eval(faces, uv)).max())
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -242,14 +248,14 @@ def test_transfer_is_exact(name: str, seed: int) -> None:
     transferred = adapt.transfer(u, fine)
     assert transferred.function_space is fine
     assert transferred.name == "v"
-    assert estimate.norm(fine, estimate.error(transferred, u)) < 1e-13  # rounding of values up to 1
+    assert largest_difference(transferred, u) < 1e-13  # rounding of values up to 1
 
 
 def test_transfer_of_all_components() -> None:
-    V = FunctionSpace(space("refined cube").hierarchy, (3,))
+    V = fem.FunctionSpace(space("refined cube").hierarchy, (3,))
     fine = adapt.refine(V, [1, 5])
     u = with_random_values(V)
-    assert estimate.norm(fine, estimate.error(adapt.transfer(u, fine), u)) < 1e-13
+    assert largest_difference(adapt.transfer(u, fine), u) < 1e-13
 
 
 def test_transfer_to_the_same_space_copies() -> None:
@@ -267,13 +273,13 @@ def test_transfer_to_a_space_that_is_no_refinement_is_refused() -> None:
     with pytest.raises(ValueError, match="spaces are not nested"):
         adapt.transfer(with_random_values(V), space("grid, crease"))
     with pytest.raises(ValueError, match=r"values of shape \(\) cannot be carried to shape \(2,\)"):
-        adapt.transfer(with_random_values(V), FunctionSpace(V.hierarchy, (2,)))
+        adapt.transfer(with_random_values(V), fem.FunctionSpace(V.hierarchy, (2,)))
 
 
 # ---- The loop
 
 
-def solve_poisson(V: FunctionSpace) -> fem.Function:
+def solve_poisson(V: fem.FunctionSpace) -> fem.Function:
     exact = wavy(ufl.SpatialCoordinate(V.mesh))
     return poisson(V, exact, 6.25 * exact)
 
@@ -289,7 +295,7 @@ def run(**options: object) -> adapt.History:
 def test_history_tells_what_each_step_came_to() -> None:
     solved: list[fem.Function] = []
 
-    def solver(V: FunctionSpace) -> fem.Function:
+    def solver(V: fem.FunctionSpace) -> fem.Function:
         solved.append(solve_poisson(V))
         return solved[-1]
 
@@ -320,6 +326,7 @@ def test_run_ends_at_the_tolerance() -> None:
 
 def test_run_ends_at_max_dofs() -> None:
     dofs = [step.dofs for step in run().steps]
+    assert [step.dofs for step in run(max_dofs=dofs[1]).steps] == dofs[:2]
     assert [step.dofs for step in run(max_dofs=dofs[1] + 1).steps] == dofs[:3]
     assert [step.dofs for step in run(max_dofs=1).steps] == dofs[:1]
 

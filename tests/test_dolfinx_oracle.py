@@ -17,7 +17,6 @@ from scipy.interpolate import BSpline
 
 import ufl
 from thccs_fem import fem, generators
-from thccs_fem.fem.space import FunctionSpace
 from ufl import div, dot, grad, inner
 
 MPI = pytest.importorskip("mpi4py.MPI")
@@ -28,7 +27,7 @@ Floats = npt.NDArray[np.float64]
 
 dx = ufl.dx(metadata={"quadrature_degree": 9})  # on both sides the same 5 x 5 points
 
-SPACES: dict[str, Callable[[], FunctionSpace]] = {
+SPACES: dict[str, Callable[[], fem.FunctionSpace]] = {
     "wheel5": lambda: fem.functionspace(generators.wheel(5, 3), ("THCCS", 3)),
     "wheel8, moved": lambda: fem.functionspace(moved_inside(generators.wheel(8, 2), 0.1), ("THCCS", 3)),
     "disc": lambda: fem.functionspace(generators.disc(2), ("THCCS", 3)),
@@ -43,7 +42,7 @@ SPACES: dict[str, Callable[[], FunctionSpace]] = {
 class Oracle:
     """A THCCS space, and the discontinuous space of DOLFINx on its pieces."""
 
-    V: FunctionSpace
+    V: fem.FunctionSpace
     Q: Any
     C: sp.csr_array  # values at the nodes of Q in terms of the functions of V
 
@@ -135,7 +134,7 @@ def test_forms_as_dolfinx_assembles_them(oracle: Oracle, kind: str) -> None:
     rng = np.random.default_rng(1)
     f, g = rng.standard_normal(V.num_dofs), rng.standard_normal(2 * V.num_dofs)
     blocked = sp.csr_array(sp.kron(C, np.eye(2)))
-    ours = fem.form(make(problem(fem, V, FunctionSpace(V.hierarchy, (2,)), f, g)), on=V)
+    ours = fem.form(make(problem(fem, V, fem.FunctionSpace(V.hierarchy, (2,)), f, g)), on=V)
     Q2 = dolfinx.fem.functionspace(Q.mesh, ("DQ", 3, (2,)))
     theirs = make(problem(dolfinx.fem, Q, Q2, C @ f, blocked @ g))
     theirs = dolfinx.fem.form(theirs)

@@ -215,6 +215,24 @@ def test_away_from_caps_the_pieces_are_the_limit_surface(name):
     np.testing.assert_allclose(found[smooth], exact[smooth], rtol=0, atol=EXACT * size)
 
 
+@pytest.mark.parametrize("name", ["wheel2", "wheel3", "wheel12", "pole", "split_face", "l_tricube", "torus_of_nine"])
+def test_caps_meet_the_limit_surface_at_their_vertices(name):
+    hierarchy = coarsest(name, "crease")
+    cells = extract(hierarchy)
+    mesh = MESHES[name]
+    compared = 0
+    for v in np.setdiff1d(np.arange(mesh.num_vertices), mesh.boundary_vertices):
+        faces, corners = np.nonzero(mesh.quads == v)
+        n = faces.size
+        along, across = mesh.quads[faces, (corners + 1) % 4], mesh.quads[faces, (corners + 2) % 4]
+        # Halstead, Kass, DeRose (1993): n^2 times the vertex, 4 times those across edges, those across faces.
+        weighted = n * n * mesh.vertices[v] + 4.0 * mesh.vertices[along].sum(0) + mesh.vertices[across].sum(0)
+        found = evaluate_pieces(cells.piece_points, *cells.locate(faces, CORNERS[corners]))
+        np.testing.assert_allclose(found, np.tile(weighted / (n * (n + 5)), (n, 1)), rtol=0, atol=EXACT)
+        compared += n != 4
+    assert compared or name == "torus_of_nine"
+
+
 @pytest.mark.parametrize("name", ["grid", "tripod", "wheel5"])
 def test_area_element(name):
     cells = extract(coarsest(name, "crease"))

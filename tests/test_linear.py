@@ -221,7 +221,8 @@ def test_constants_are_found_if_a_coefficient_makes_them() -> None:
 
 
 def test_forms_say_whether_they_drop_constants() -> None:
-    V, w = torus((2,)), fem.Function(torus((2,)))
+    V = torus((2,))
+    w = fem.Function(V)
     u, v = arguments(V)
     x = ufl.SpatialCoordinate(V.mesh)
     one_sided = inner(grad(u) * as_vector([x[2], x[0], 1.0]), v) * dx

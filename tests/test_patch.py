@@ -7,6 +7,7 @@ from problems import moved_inside, poisson, randomly_refined
 import ufl
 from thccs_fem import adapt, element, fem, generators, limit
 from thccs_fem.boundary import BoundaryRule
+from thccs_fem.hierarchy import CAP_LEVEL
 from thccs_fem.mesh import ControlMesh
 
 VALENCES = [3, 5, 6, 8]
@@ -22,8 +23,8 @@ def moved_wheel(valence: int, seed: int = 0) -> ControlMesh:
     return moved_inside(generators.wheel(valence, SECTOR), 0.2, seed)
 
 
-def space(msh: ControlMesh, rule: BoundaryRule) -> fem.FunctionSpace:
-    return fem.functionspace(msh, ("THCCS", 3), boundary=rule)
+def space(msh: ControlMesh, rule: BoundaryRule, cap_level: int = CAP_LEVEL) -> fem.FunctionSpace:
+    return fem.functionspace(msh, ("THCCS", 3), boundary=rule, cap_level=cap_level)
 
 
 def linear(x: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
@@ -46,10 +47,11 @@ def test_patch(valence: int, rule: BoundaryRule) -> None:
 
 @each_rule
 @each_valence
-def test_patch_with_one_sector_refined(valence: int, rule: BoundaryRule) -> None:
-    """The spokes between sectors of different levels end in one cap: its level is the same for all sectors."""
+@pytest.mark.parametrize("cap_level", [1, CAP_LEVEL])
+def test_patch_with_one_sector_refined(valence: int, rule: BoundaryRule, cap_level: int) -> None:
+    """Sectors of different levels are cut down to one cap level; it sinks for all of them if one is refined too far."""
     msh = moved_wheel(valence)
-    V = space(msh, rule)
+    V = space(msh, rule, cap_level)
     centre = 0
     sectors = np.flatnonzero((msh.quads == centre).any(axis=1))
     for level, (face, uv) in enumerate([(8, 0.0), (4, 0.0), (0, 0.5)]):  # vertex (2, 2) / 2^level of the first sector

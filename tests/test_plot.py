@@ -48,16 +48,21 @@ def test_facets_and_lines_are_on_the_surface(name: str) -> None:
         assert not drawn.points[:, mesh.gdim :].any()
 
 
+def cosines_of_normals(facets: pyvista.PolyData) -> np.ndarray:
+    """Cosines between the normals given at the corners of the facets and those of the facets."""
+    corners = facets.points[facets.regular_faces]
+    flat = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+    return np.einsum("fcx,fx->fc", facets.point_data["Normals"][facets.regular_faces], flat)
+
+
 @each_mesh
 def test_facets_are_turned_as_their_normals(name: str) -> None:
     facets = plot.surface(space(ZOO[name]()))
     normals = facets.point_data["Normals"]
     assert facets.point_data.active_normals_name == "Normals"
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, rtol=0, atol=EXACT)
-    corners = facets.points[facets.regular_faces]
-    flat = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True)
-    cosines = np.einsum("fcx,fx->fc", normals[facets.regular_faces], flat)
+    cosines = cosines_of_normals(facets)
     assert cosines.min() > 0.8  # facets turn by much where the surface is sharply bent
     assert np.median(cosines) > 0.999
 
@@ -201,6 +206,31 @@ def test_camera(picture: Any) -> None:
     assert (picture(V, camera=(1.0, 0.0, 0.0)) != from_above).any()
     far = picture(V, camera=[(0.0, 0.0, 100.0), (0.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
     assert 0.0 < (far != WHITE).any(axis=2).mean() < 0.05
+
+
+def test_warped_plane_is_the_graph() -> None:
+    u = some_function(space(generators.wheel(5, 2)))
+    facets, lines = plot.surface(u, warp=0.5), plot.mesh_lines(u, warp=0.5)
+    for drawn in (facets, lines):
+        np.testing.assert_allclose(drawn.points[:, 2], 0.5 * drawn.point_data["u"], rtol=0, atol=EXACT)
+    assert np.median(cosines_of_normals(facets)) > 0.99
+    assert np.median(np.abs(facets.point_data["Normals"][:, 2])) < 0.95  # the normals of the plane would fail
+
+
+def test_surface_is_warped_by_vectors() -> None:
+    x = position(space(ZOO["tripod"](), (3,)))
+    for drawn in (plot.surface(x, warp=-0.5), plot.mesh_lines(x, warp=-0.5)):
+        np.testing.assert_allclose(drawn.points, 0.5 * drawn.point_data["x"], rtol=0, atol=EXACT)
+
+
+def test_what_can_not_be_warped() -> None:
+    u = some_function(space(ZOO["torus"]()))
+    with pytest.raises(ValueError, match=r"'u', with 1 component\(s\), can not warp a surface in 3 dimensions: .*"):
+        plot.surface(u, warp=1.0)
+    with pytest.raises(ValueError, match=r"a space can not warp .*; leave warp out"):
+        plot.mesh_lines(u.function_space, warp=1.0)
+    with pytest.raises(ValueError, match=r"warp is nan; expected a finite factor"):
+        plot.surface(u, warp=np.nan)
 
 
 def test_without_a_file_there_is_a_window(monkeypatch: pytest.MonkeyPatch, picture: Any) -> None:

@@ -3,8 +3,7 @@
 At a boundary vertex v with two faces the crease rule continues the surface by a phantom point 2 P_v - P_w, w the vertex
 across.  The clamped space frees that point: delta_v is how far the ghost lies from the phantom.  Its functions are
 N_i(s) (1 - t)^3 / 6 along the rim, and all of its algebra is a correction to the crease rule on the rim alone.  A
-corner of
-one face has three such scalars: along its outgoing rim edge (A), its incoming one (B), and mixed (M).
+corner of one face has three such scalars: along its outgoing rim edge (A), its incoming one (B), and mixed (M).
 
 The degrees of freedom that make it clamped, written q, are values of the trace and a third of an edge inside:
 
@@ -256,8 +255,8 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
 def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:
     """Return the trace functions whose support meets the marked faces, shape (num_traces,).
 
-    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2, the walk ending at corners; of a
-    corner's q10 and q01 those of the two edges along its rim; of q00 its one face.
+    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2; of a corner's q10 and q01 those of the
+    two edges along its rim; of q00 its one face.
     """
     level = boundary.level
     a, b, hit = _rim_edges(level, faces)
@@ -295,8 +294,10 @@ def _rim_edges(level: Level, faces: Bools) -> tuple[Ints, Ints, Bools]:
 
 
 def _one_edge_further(level: Level, a: Ints, b: Ints, edges: Bools) -> Bools:
-    """Return the marked rim edges a -> b and those next to them; walks end at corners."""
+    """Return the marked rim edges a -> b and those next to them.
+
+    Walks may turn a free corner: its two rim edges have the same face.
+    """
     passing = np.zeros(level.num_vertices, dtype=bool)
     passing[a[edges]] = passing[b[edges]] = True
-    passing &= ~level.corner
     return edges | passing[a] | passing[b]

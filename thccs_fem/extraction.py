@@ -67,7 +67,7 @@ class Batch:
         return np.repeat(self.cells, np.diff(self.offsets))
 
     def local(self, u: Floats) -> Floats:
-        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, k); u has shape (num_dofs, k)."""
+        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, k), u (num_dofs, k)."""
         if self.operators is None:
             return u[self.dofs]
         values = np.where((self.dofs >= 0)[..., None], u[self.dofs], 0.0)
@@ -88,6 +88,7 @@ class Cells:
         piece_origin: Where the piece's (0, 0) lies in its cell, shape (num_pieces, 2).
         piece_axes: Its edges u and v there, in columns, shape (num_pieces, 2, 2).
         piece_of_face: For each level, the piece that a face of the level is, or -1.
+        quadrature_degree: That of the only rule for which integrals over these pieces mean anything; None: any.
     """
 
     hierarchy: Hierarchy
@@ -99,6 +100,7 @@ class Cells:
     piece_origin: Floats
     piece_axes: Floats
     piece_of_face: tuple[Ints, ...]
+    quadrature_degree: int | None = None
 
     @property
     def num_cells(self) -> int:
@@ -184,7 +186,7 @@ class Cells:
         return np.sqrt(np.maximum(uu * vv - uv_**2, 0.0))
 
     def local(self, u: Floats) -> Floats:
-        """Return the local B-spline coefficients of all pieces, shape (num_pieces, 16, k); u has shape (num_dofs, k)."""
+        """Return the local B-spline coefficients of all pieces, shape (num_pieces, 16, k), u (num_dofs, k)."""
         return np.concatenate([batch.local(u) for batch in self.batches])
 
     def locate(
@@ -237,10 +239,9 @@ class _Pieces:
 
     cell: Ints
     face: Ints
-    nodes: Ints  # into the points of this level
-    points: Floats
-    rows: sp.csr_array  # 16 rows a piece: local B-spline coefficients in terms of the dofs
-    regular: Bools
+    nodes: Ints  # rows of points and of coefficients, 16 a piece
+    points: Floats  # the control vertices of the level, then the points of pieces that are not regular
+    coefficients: sp.csr_array  # the same in terms of the dofs
     origin: Floats
     axes: Floats
 
@@ -253,8 +254,7 @@ def extract(hierarchy: Hierarchy) -> Cells:
     first_node = np.cumsum([0, *(len(p.points) for p in pieces[:-1])])
     nodes = np.concatenate([first + p.nodes for first, p in zip(first_node, pieces, strict=True)]).astype(np.int32)
     cell = np.concatenate([p.cell for p in pieces])
-    rows = sp.csr_array(sp.vstack([p.rows for p in pieces], format="csr"))
-    batches, order = _batches(cell, nodes, rows)
+    batches, order = _batches(cell, nodes, sp.csr_array(sp.vstack([p.coefficients for p in pieces], format="csr")))
     place = np.zeros(order.size, dtype=np.int32)
     place[order] = np.arange(order.size, dtype=np.int32)
     return Cells(
@@ -345,55 +345,52 @@ def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Float
     nodes = np.zeros((faces.size, 16), dtype=np.int32)
     nodes[regular] = grid
     nodes[~regular] = level.num_vertices + np.arange(16 * num_masked).reshape(-1, 16)
-    stacked = sp.vstack([coefficients[grid.ravel()], masked], format="csr")
-    order = np.argsort(np.concatenate([np.flatnonzero(regular), np.flatnonzero(~regular)]), kind="stable")
     return _Pieces(
         cell=cell,
         face=faces,
         nodes=nodes,
         points=np.concatenate([points, to_spline @ (masks[:, : level.num_vertices] @ points)]),
-        rows=sp.csr_array(stacked[(16 * order[:, None] + np.arange(16)).ravel()]),
-        regular=regular,
+        coefficients=sp.csr_array(sp.vstack([coefficients[: level.num_vertices], masked], format="csr")),
         origin=origin,
         axes=axes,
     )
 
 
-def _batches(cell: Ints, nodes: Ints, rows: sp.csr_array) -> tuple[tuple[Batch, ...], Ints]:
+def _batches(cell: Ints, nodes: Ints, coefficients: sp.csr_array) -> tuple[tuple[Batch, ...], Ints]:
     """Sort pieces into batches; return them and the order in which the pieces stand in them."""
-    identity = _is_identity(rows)
+    coefficients.sort_indices()
+    identity, dof = _identity(nodes, coefficients)
     same = np.flatnonzero(identity)
     same = same[np.argsort(cell[same], kind="stable")]
     batches = []
     if same.size:
-        dofs = rows.indices[rows.indptr[16 * same][:, None] + np.arange(16)].astype(np.int32)
-        batches.append(Batch(cell[same], dofs, np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
+        batches.append(Batch(cell[same], dof[nodes[same]], np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
     others = np.flatnonzero(~identity).astype(np.int32)
     others = others[np.argsort(cell[others], kind="stable")]
-    general, order = _general_batches(cell[others], nodes[others], rows, others)
+    general, order = _general_batches(cell[others], nodes[others], coefficients, others)
     return (*batches, *general), np.concatenate([same, *order]).astype(np.int32)
 
 
-def _is_identity(rows: sp.csr_array) -> Bools:
-    """Return the pieces whose 16 coefficients are 16 different dofs."""
-    single = (np.diff(rows.indptr).reshape(-1, 16) == 1).all(axis=1)
-    candidates = np.flatnonzero(single)
-    first = rows.indptr[16 * candidates][:, None] + np.arange(16)
-    dofs = np.sort(rows.indices[first], axis=1)
-    single[candidates] = (rows.data[first] == 1.0).all(axis=1) & (np.diff(dofs, axis=1) > 0).all(axis=1)
-    return single
+def _identity(nodes: Ints, coefficients: sp.csr_array) -> tuple[Bools, Ints]:
+    """Return the pieces whose 16 coefficients are 16 different dofs, and the dof that each node is, or -1."""
+    single = np.flatnonzero(np.diff(coefficients.indptr) == 1)
+    entry = coefficients.indptr[single]
+    one = coefficients.data[entry] == 1.0
+    dof = _scattered(coefficients.shape[0], single[one], coefficients.indices[entry[one]])
+    identity = (dof[nodes] >= 0).all(axis=1)
+    identity[identity] = (np.diff(np.sort(dof[nodes[identity]], axis=1), axis=1) > 0).all(axis=1)
+    return identity, dof
 
 
-def _general_batches(cell: Ints, nodes: Ints, rows: sp.csr_array, pieces: Ints) -> tuple[list[Batch], list[Ints]]:
+def _general_batches(
+    cell: Ints, nodes: Ints, coefficients: sp.csr_array, pieces: Ints
+) -> tuple[list[Batch], list[Ints]]:
     """Return batches of dense operators for the given pieces, which are sorted by cell, and their pieces."""
     if not pieces.size:
         return [], []
     cells, first, count = (a.astype(np.int32) for a in np.unique(cell, return_index=True, return_counts=True))
-    entries = sp.csr_array(rows[(16 * pieces[:, None] + np.arange(16)).ravel()])
-    entries.sort_indices()
-    entries.indptr, entries.indices = entries.indptr.astype(np.int32), entries.indices.astype(np.int32)
-    cell_rows = 16 * np.append(first, np.int32(pieces.size))
-    offsets, dofs = _dofs_of_cells(entries, cell_rows)
+    rows = _Rows(16 * np.append(first, np.int32(pieces.size)), nodes.ravel(), coefficients)
+    offsets, dofs = rows.columns()
     size = np.diff(offsets)
     width = -(-size // WIDTH) * WIDTH
     # Blocks of equal width follow one another, so that each batch is one piece of memory.
@@ -402,7 +399,7 @@ def _general_batches(cell: Ints, nodes: Ints, rows: sp.csr_array, pieces: Ints) 
     starts = np.zeros(cells.size, dtype=np.int64)
     starts[order] = np.cumsum(blocks) - blocks
     values = np.zeros(blocks.sum())
-    _run("thccs_dense_rows", cells.size, cell_rows, entries, entries.data, offsets, dofs, width, starts, values)
+    rows.run("thccs_dense_rows", coefficients.data, offsets, dofs, width, starts, values)
     batches, batch_pieces = [], []
     for w in np.unique(width):
         chosen = order[width[order] == w]
@@ -417,27 +414,38 @@ def _general_batches(cell: Ints, nodes: Ints, rows: sp.csr_array, pieces: Ints) 
     return batches, batch_pieces
 
 
-def _dofs_of_cells(entries: sp.csr_array, cell_rows: Ints) -> tuple[Ints, Ints]:
-    """Return offsets, shape (cells + 1,), and the ascending dofs that occur in the rows of each cell."""
-    num_cells = cell_rows.size - 1
-    counts = np.zeros(num_cells, dtype=np.int32)
-    seen = np.full(entries.shape[1], -1, dtype=np.int32)
-    _run("thccs_cell_columns", num_cells, cell_rows, entries, seen, counts, None, None)
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-    dofs = np.zeros(offsets[-1], dtype=np.int32)
-    seen[:] = -1
-    _run("thccs_cell_columns", num_cells, cell_rows, entries, seen, counts, offsets, dofs)
-    return offsets, dofs
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows of a matrix, cell by cell, for the loops of kernels.c.
 
+    Attributes:
+        offsets: Rows of the k-th cell are rows[offsets[k]] .. rows[offsets[k + 1]], shape (cells + 1,).
+        rows: Rows of the matrix.
+        matrix: Column indices of a row ascend.
+    """
 
-def _run(
-    function: str, num_cells: int, cell_rows: Ints, entries: sp.csr_array, *arrays: npt.NDArray[Any] | None
-) -> None:
-    """Call a loop of kernels.c on the rows of cells."""
-    module = jit.library()
-    c_types = {"i4": "int32_t[]", "i8": "int64_t[]", "f8": "double[]"}
-    pointers = [
-        module.ffi.NULL if a is None else module.ffi.from_buffer(c_types[a.dtype.str[1:]], a)
-        for a in (cell_rows, entries.indptr, entries.indices, *arrays)
-    ]
-    getattr(module.lib, function)(num_cells, *pointers)
+    offsets: Ints
+    rows: Ints
+    matrix: sp.csr_array
+
+    def columns(self) -> tuple[Ints, Ints]:
+        """Return offsets, shape (cells + 1,), and the ascending columns that occur in the rows of each cell."""
+        counts = np.zeros(self.offsets.size - 1, dtype=np.int32)
+        seen = np.full(self.matrix.shape[1], -1, dtype=np.int32)
+        self.run("thccs_cell_columns", seen, counts, None, None)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        columns = np.zeros(offsets[-1], dtype=np.int32)
+        seen[:] = -1
+        self.run("thccs_cell_columns", seen, counts, offsets, columns)
+        return offsets, columns
+
+    def run(self, function: str, *arrays: npt.NDArray[Any] | None) -> None:
+        """Call a loop of kernels.c."""
+        module = jit.library()
+        c_types = {"i4": "int32_t[]", "i8": "int64_t[]", "f8": "double[]"}
+        indptr, indices = (a.astype(np.int32, copy=False) for a in (self.matrix.indptr, self.matrix.indices))
+        pointers = [
+            module.ffi.NULL if a is None else module.ffi.from_buffer(c_types[a.dtype.str[1:]], a)
+            for a in (self.offsets, self.rows, indptr, indices, *arrays)
+        ]
+        getattr(module.lib, function)(self.offsets.size - 1, *pointers)

@@ -121,8 +121,7 @@ class Hierarchy:
 
         A mesh with polygons other than quads, or one whose level-0 functions are dependent, is subdivided once.
         """
-        if cap_level < 1:
-            raise ValueError(f"cap_level is {cap_level}; a cap needs at least one cut: give 1 or more")
+        _check_cap_level(cap_level)
         root = control_level(mesh)
         if not root.is_quad or _is_dependent(root):
             root = _as_level_zero(subdivide(root, np.ones(root.num_faces, dtype=bool)).fine)
@@ -222,8 +221,19 @@ class Hierarchy:
             keys[0] = np.union1d(keys[0], self.root.keys[_dependent_faces(self.root)])
         return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
 
+    def with_caps_at(self, cap_level: int) -> Self:
+        """Return the hierarchy with another least cap level; the dofs stay as they are.
+
+        Raises:
+            ValueError: If the level is less than 1.
+        """
+        _check_cap_level(cap_level)
+        return self._build(self.mesh, self.rule, cap_level, self.refined_keys, self.root)
+
     def truncated_to(self, num_levels: int) -> Self:
-        """Return the hierarchy with Omega^num_levels and everything finer emptied."""
+        """Return the hierarchy with Omega^num_levels and everything finer emptied; num_levels is 1 or more."""
+        if num_levels < 1:
+            raise ValueError(f"num_levels is {num_levels}; level 0 is always there: give 1 or more")
         return self._build(self.mesh, self.rule, self.cap_level, self.refined_keys[: num_levels - 1], self.root)
 
     def is_refinement_of(self, other: Hierarchy) -> bool:
@@ -275,6 +285,11 @@ def _is_dependent(root: Level) -> bool:
 def _as_level_zero(level: Level) -> Level:
     """Return a first subdivision as level 0 of a hierarchy."""
     return replace(level, number=0, control_vertex=np.arange(level.num_vertices, dtype=np.int32))
+
+
+def _check_cap_level(cap_level: int) -> None:
+    if cap_level < 1:
+        raise ValueError(f"cap_level is {cap_level}; a cap needs at least one cut: give 1 or more")
 
 
 def _check_depth(root: Level, deepest: int) -> None:

@@ -402,18 +402,20 @@ static int ascending(const void *a, const void *b)
   return (x > y) - (x < y);
 }
 
-void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
-                        int32_t *seen, int32_t *counts, const int32_t *offsets, int32_t *columns)
+void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
+                        const int32_t *indices, int32_t *seen, int32_t *counts, const int32_t *offsets,
+                        int32_t *columns)
 {
   for (int32_t c = 0; c < num_cells; ++c) {
     int32_t count = 0;
-    for (int32_t k = indptr[cell_rows[c]]; k < indptr[cell_rows[c + 1]]; ++k)
-      if (seen[indices[k]] != c) {
-        seen[indices[k]] = c;
-        if (columns)
-          columns[offsets[c] + count] = indices[k];
-        ++count;
-      }
+    for (int32_t r = cell_rows[c]; r < cell_rows[c + 1]; ++r)
+      for (int32_t k = indptr[rows[r]]; k < indptr[rows[r] + 1]; ++k)
+        if (seen[indices[k]] != c) {
+          seen[indices[k]] = c;
+          if (columns)
+            columns[offsets[c] + count] = indices[k];
+          ++count;
+        }
     if (columns)
       qsort(columns + offsets[c], count, sizeof *columns, ascending);
     else
@@ -421,15 +423,15 @@ void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32
   }
 }
 
-void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
-                      const double *data, const int32_t *offsets, const int32_t *columns, const int32_t *width,
-                      const int64_t *starts, double *values)
+void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
+                      const int32_t *indices, const double *data, const int32_t *offsets, const int32_t *columns,
+                      const int32_t *width, const int64_t *starts, double *values)
 {
   for (int32_t c = 0; c < num_cells; ++c)
     for (int32_t r = cell_rows[c]; r < cell_rows[c + 1]; ++r) {
       double *row = values + starts[c] + (int64_t)(r - cell_rows[c]) * width[c];
       const int32_t *column = columns + offsets[c];
-      for (int32_t k = indptr[r]; k < indptr[r + 1]; ++k) {
+      for (int32_t k = indptr[rows[r]]; k < indptr[rows[r] + 1]; ++k) {
         while (*column != indices[k])
           ++column;
         row[column - (columns + offsets[c])] = data[k];

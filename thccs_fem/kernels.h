@@ -72,14 +72,14 @@ void thccs_tabulate(thccs_kernel *kernel, int32_t n, int32_t num_values, int32_t
 void thccs_evaluate_patches(int64_t n, const int32_t *patches, const double *uv, int32_t size,
                             const double *coefficients, int32_t rows, double *out);
 
-/* The different columns of the rows of each cell. Cell c has rows cell_rows[c] .. cell_rows[c + 1] of the CSR matrix
-   (indptr, indices). First with columns NULL: counts[c] becomes their number; then with offsets (cells + 1) the
+/* The different columns of the rows of each cell. Cell c has rows[cell_rows[c] .. cell_rows[c + 1]] of the CSR
+   matrix (indptr, indices). First with columns NULL: counts[c] becomes their number; then with offsets (cells + 1) the
    columns are written, ascending. seen (matrix columns) is -1 before each call. */
-void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
-                        int32_t *seen, int32_t *counts, const int32_t *offsets, int32_t *columns);
+void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
+                        const int32_t *indices, int32_t *seen, int32_t *counts, const int32_t *offsets,
+                        int32_t *columns);
 
-/* The rows of each cell as dense blocks over its columns. Row r of cell c, width[c] wide, begins at
-   values[starts[c] + (r - cell_rows[c]) * width[c]]. The indices of each row are ascending; values are 0 before. */
-void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *indptr, const int32_t *indices,
-                      const double *data, const int32_t *offsets, const int32_t *columns, const int32_t *width,
-                      const int64_t *starts, double *values);
+/* The rows of each cell as dense blocks over its columns. The block of cell c, width[c] wide, begins at values[starts[c]]. The indices of each row are ascending; values are 0 before. */
+void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
+                      const int32_t *indices, const double *data, const int32_t *offsets, const int32_t *columns,
+                      const int32_t *width, const int64_t *starts, double *values);

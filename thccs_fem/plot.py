@@ -58,6 +58,7 @@ def plot(
     clim: Sequence[float] | None = None,
     cmap: Any = "viridis",
     lines: bool = True,
+    warp: float = 0.0,
     window_size: tuple[int, int] = (1600, 1200),
 ) -> None:
     """Draw a function, or only the elements of a space, on the limit surface.
@@ -70,18 +71,20 @@ def plot(
         clim: Values at the ends of the colour map; by default the least and the largest there are.
         cmap: Colour map as PyVista takes it.
         lines: Whether to draw the sides of the elements.
+        warp: Draw a function on a planar domain as a graph, this times the values high; move the points of the surface
+            by this times a function with as many components as they have.
         window_size: Width and height in pixels.
 
     Raises:
         TypeError: If `uh` is neither function nor space.
-        ValueError: If the file is not called .png, the function has values that are not finite, or `clim` is no
-        interval.
+        ValueError: If the file is not called .png, the function has values that are not finite or can not warp the
+            surface, or `clim` is no interval.
         OSError: If the file cannot be written, or there is nothing to draw on.
     """
     import pyvista
 
     path = None if filename is None else _checked(Path(filename))
-    facets, sides = surface(uh), mesh_lines(uh) if lines else None
+    facets, sides = surface(uh, warp=warp), mesh_lines(uh, warp=warp) if lines else None
     with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
         plotter: Any = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
     try:
@@ -102,7 +105,7 @@ def plot(
             plotter.close()
 
 
-def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
+def surface(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyData:
     """Return the limit surface as facets, for pictures of one's own.
 
     Point data are the normals and, by its name, the function; cell data are the numbers of `vtk.cell_numbers`. Pieces
@@ -110,20 +113,21 @@ def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
 
     Args:
         uh: The function, or a space.
+        warp: As for `plot`.
 
     Raises:
         TypeError: If `uh` is neither function nor space.
-        ValueError: If the function has values that are not finite.
+        ValueError: If the function has values that are not finite or can not warp the surface.
     """
     import pyvista
 
-    cells, values = _cells_and_values(uh)
+    cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
     points, normals, sampled, facets, piece = [], [], [], [], []
     num_points = 0
-    for n, pieces in _by_segments(cells, values):
+    for n, pieces in _by_segments(points_of_pieces, values):
         t = np.linspace(0.0, 1.0, n + 1)
         along, slopes = element.bspline_values(t), element.bspline_slopes(t)
-        local = cells.piece_points[pieces]
+        local = points_of_pieces[pieces]
         points.append(_on_grid(along, along, local))
         normals.append(_normals(_on_grid(slopes, along, local), _on_grid(along, slopes, local)))
         sampled.append(_on_grid(along, along, values[pieces]))
@@ -140,25 +144,26 @@ def surface(uh: Function | FunctionSpace) -> pyvista.PolyData:
     return mesh
 
 
-def mesh_lines(uh: Function | FunctionSpace) -> pyvista.PolyData:
+def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyData:
     """Return the sides of the elements as lines along the facets of `surface`; elements share no lines.
 
     Args:
         uh: The function, or a space.
+        warp: As for `plot`.
 
     Raises:
         TypeError, ValueError: As for `surface`.
     """
     import pyvista
 
-    cells, values = _cells_and_values(uh)
+    cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
     outer = _on_cell_boundary(cells)
     points, sampled, lines = [], [], []
     num_points = 0
-    for n, pieces in _by_segments(cells, values):
+    for n, pieces in _by_segments(points_of_pieces, values):
         piece, side = np.nonzero(outer[pieces])
         on_sides = _on_sides(n)[side]
-        points.append((on_sides @ cells.piece_points[pieces[piece]]).reshape(-1, cells.points.shape[1]))
+        points.append((on_sides @ points_of_pieces[pieces[piece]]).reshape(-1, points_of_pieces.shape[2]))
         sampled.append((on_sides @ values[pieces[piece]]).reshape(-1, values.shape[2]))
         number = num_points + np.arange(len(points[-1])).reshape(-1, n + 1)
         lines.append(np.insert(number, 0, n + 1, axis=1).ravel())
@@ -188,9 +193,26 @@ def _cells_and_values(uh: Function | FunctionSpace) -> tuple[Cells, Floats]:
     return uh.function_space.cells, uh.local_coefficients()
 
 
-def _by_segments(cells: Cells, values: Floats) -> Iterator[tuple[int, Ints]]:
-    """Yield numbers of segments along a side and the pieces that are to have so many."""
+def _cells_points_and_values(uh: Function | FunctionSpace, warp: float) -> tuple[Cells, Floats, Floats]:
+    """Return cells, local B-spline coefficients of the points to draw, shape (num_pieces, 16, 2 or 3), and values."""
+    cells, values = _cells_and_values(uh)
     points = cells.piece_points
+    if warp == 0.0:
+        return cells, points, values
+    if not np.isfinite(warp):
+        raise ValueError(f"warp is {warp}; expected a finite factor")
+    size, gdim = values.shape[2], points.shape[2]
+    if isinstance(uh, FunctionSpace) or not (size == gdim or (size == 1 and gdim == 2)):
+        what = "a space" if isinstance(uh, FunctionSpace) else f"{uh.name!r}, with {size} component(s),"
+        raise ValueError(
+            f"{what} can not warp a surface in {gdim} dimensions: warp draws the graph of a function on a planar "
+            f"domain, or moves points by a function with as many components as they have; leave warp out"
+        )
+    return cells, points + warp * values if size == gdim else np.concatenate([points, warp * values], axis=2), values
+
+
+def _by_segments(points: Floats, values: Floats) -> Iterator[tuple[int, Ints]]:
+    """Yield numbers of segments along a side and the pieces that are to have so many."""
     diameter, value_range = (np.linalg.norm(np.ptp(x, axis=(0, 1))) for x in (points, values))
     seen = max(SHADE * value_range, ROUNDING * np.abs(values).max(), np.finfo(float).tiny)
     squared = 0.75 * np.maximum(_difference(points, 2) / (GAP * diameter), _difference(values, 2) / seen)

@@ -160,7 +160,7 @@ def _broadcast(value: Floats, dofs: Indices, functions: Indices, k: int) -> Floa
         return np.broadcast_to(value, (functions.size, k))
     if value.shape in ((dofs.size,), (dofs.size, k)):
         _, first = np.unique(dofs, return_index=True)
-        return np.broadcast_to(value.reshape(dofs.size, -1), (dofs.size, k))[first]
+        return np.broadcast_to(value if value.ndim == 2 else value[:, None], (dofs.size, k))[first]
     raise ValueError(
         f"a value of shape {value.shape} does not fit {dofs.size} dofs with {k} components: give a number, one value a "
         f"component, one a dof, or shape ({dofs.size}, {k})"
@@ -233,8 +233,12 @@ def _projected(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k
     weighted = sp.csr_array(sp.diags_array(weights) @ basis)
     present = np.unique(weighted.indices)
     mass = sp.csc_array((basis.T @ weighted)[present][:, present])
-    mass.setdiag((1.0 + RIDGE) * mass.diagonal())
-    fitted = spla.splu(mass).solve((weighted.T @ np.nan_to_num(values))[present])
+    load = (weighted.T @ np.nan_to_num(values))[present]
+    regular = mass.copy()
+    regular.setdiag((1.0 + RIDGE) * mass.diagonal())
+    factors = spla.splu(regular)
+    fitted = factors.solve(load)
+    fitted += factors.solve(load - mass @ fitted)  # takes back what RIDGE has changed
     return fitted[np.searchsorted(present, functions)]
 
 

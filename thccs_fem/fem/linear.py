@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.sparse import csgraph
-from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 
 import ufl
 from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
@@ -26,6 +25,7 @@ from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
+from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 
 __all__ = [
     "Constants",

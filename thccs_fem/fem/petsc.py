@@ -170,9 +170,9 @@ def _new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
             f"PETSc was built for {np.dtype(PETSc.ScalarType)}; forms here are real, double precision: use such a build"
         )
     test, trial = spaces
-    block_sizes = (test.block_size, trial.block_size)
-    csr = (A.indptr, A.indices, A.data)
-    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, bsize=block_sizes, comm=_comm(test))
+    csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
+    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=_comm(test))
+    mat.setBlockSizes(test.block_size, trial.block_size)
     mat.setAttr("values", A)
     return mat
 

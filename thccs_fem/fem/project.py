@@ -11,7 +11,7 @@ from thccs_fem import element
 from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.forms import form
-from thccs_fem.fem.function import Function
+from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.scipy import conjugate_gradients
 from thccs_fem.fem.space import FunctionSpace
 
@@ -34,12 +34,14 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
 
     Raises:
         TypeError: The value is none of these.
-        ValueError: The value has another shape than the functions of V.
+        ValueError: The value has another shape than the functions of V, or is not finite somewhere.
     """
     if callable(value) and not isinstance(value, ufl.core.expr.Expr):
         load = _load_at_points(value, V)
     else:
-        load = _load(_as_ufl(value), V)
+        load = _load(_as_ufl(value, V), V)
+    if not np.isfinite(load).all():
+        raise ValueError("the value is not finite everywhere on the surface: give one that is")
     scalar = FunctionSpace(V.hierarchy)
     mass = assemble_matrix(
         form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
@@ -50,7 +52,7 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
     return projection
 
 
-def _as_ufl(value: object) -> ufl.core.expr.Expr:
+def _as_ufl(value: object, V: FunctionSpace) -> ufl.core.expr.Expr:
     if isinstance(value, ufl.core.expr.Expr):
         return value
     try:
@@ -59,7 +61,7 @@ def _as_ufl(value: object) -> ufl.core.expr.Expr:
         raise TypeError(
             f"a {type(value).__name__} cannot be projected: give a UFL expression, a function g(x), or numbers"
         ) from error
-    return ufl.as_vector(numbers.tolist()) if numbers.ndim else ufl.as_ufl(float(numbers))
+    return Constant(V.mesh, numbers)
 
 
 def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
@@ -68,9 +70,10 @@ def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
         raise ValueError(
             f"a value of shape {value.ufl_shape} cannot be projected on functions of shape {V.value_shape}"
         )
-    return assemble_vector(form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx, quadrature_degree=DEGREE)).reshape(
-        -1, V.block_size
-    )
+    if isinstance(value, ufl.classes.Zero):
+        return np.zeros((V.num_functions, V.block_size))
+    L = form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx, quadrature_degree=DEGREE)
+    return assemble_vector(L).reshape(-1, V.block_size)
 
 
 def _load_at_points(value: ValueOrExpression, V: FunctionSpace) -> Floats:

@@ -1,0 +1,173 @@
+"""Two other ways to integrate over irregular elements, to compare the bicubic caps with (Wei et al. 2015, sec. 6.3).
+
+The functions of the space are the same, but for the cap itself, and so are their coefficients:
+
+* `paper_cells`: the paper's rule, 4 x 4 Gauss points on each whole element, where functions, map and derivatives are
+  evaluated exactly at the points (eq. 9).  It takes an irregular element for as smooth as a regular one.
+* `without_caps`: elements are cut as for caps, and what is left at the extraordinary vertices is left out.
+
+Both make `Cells` that forms are integrated on in place of those of the space::
+
+    W = V.with_integration(quadrature.paper_cells)
+    uh = LinearProblem(a(W), L(W), bcs=...).solve()
+
+For the paper's rule to work with any form, each Gauss point has a *piece* of its own: the bicubic polynomial that
+functions and map are around the point, on a square with the point at its centre and the point's weight as its area.
+A kernel with the one-point rule on all these squares is the paper's quadrature, term by term.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from thccs_fem.extraction import Batch, Cells, extract
+from thccs_fem.hierarchy import Hierarchy
+from thccs_fem.subdivision import Bools
+
+__all__ = ["paper_cells", "without_caps"]
+
+Floats = npt.NDArray[np.float64]
+
+NUM_GAUSS = 4  # points along each side of an element
+DEPTH = 4  # cuts after which no Gauss point is left in a cap: they keep 0.069 from the sides, more than 2^-4
+
+# The monomials' coefficients, constant first, of the four uniform cubic B-splines on [0, 1], times 6.
+_TO_MONOMIALS_TIMES_6 = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
+
+
+def paper_cells(hierarchy: Hierarchy) -> Cells:
+    """Return cells whose pieces are Gauss points: 16 a cell, regular or not, to be integrated with degree 1.
+
+    Points in an irregular element lie in regular sub-elements after four cuts at most, whatever the level of the caps.
+    Pieces of these cells overlap, and none is at the boundary: they are good for integrals over cells and nothing else.
+
+    Args:
+        hierarchy: The hierarchy.
+    """
+    cells = extract(hierarchy.with_caps_at(max(hierarchy.cap_level, hierarchy.num_levels - 1 + DEPTH)))
+    ends = np.cumsum([batch.num_pieces for batch in cells.batches])
+    batches, points, origins, axes = [], [], [], []
+    for batch, end in zip(cells.batches, ends, strict=True):
+        mine = slice(end - batch.num_pieces, end)
+        piece, centre, side = _gauss_points(batch, cells.piece_origin[mine], cells.piece_axes[mine])
+        restriction = _restriction(centre, side)
+        first_node = 16 * sum(map(len, points))
+        batches.append(
+            Batch(
+                cells=batch.cells,
+                dofs=batch.dofs,
+                offsets=np.arange(0, piece.size + 1, NUM_GAUSS**2, dtype=np.int32),
+                nodes=(first_node + np.arange(16 * piece.size)).reshape(-1, 16).astype(np.int32),
+                operators=restriction if batch.operators is None else restriction @ batch.operators[piece],
+            )
+        )
+        points.append(restriction @ cells.piece_points[mine][piece])
+        axes.append(cells.piece_axes[mine][piece] * side[:, None, None])
+        corner = centre - side[:, None] / 2.0
+        origins.append(cells.piece_origin[mine][piece] + np.einsum("nij,nj->ni", cells.piece_axes[mine][piece], corner))
+    return replace(
+        cells,
+        points=np.concatenate(points).reshape(-1, cells.points.shape[1]),
+        batches=tuple(batches),
+        piece_origin=np.concatenate(origins),
+        piece_axes=np.concatenate(axes),
+        piece_of_face=tuple(np.full_like(faces, -1) for faces in cells.piece_of_face),
+        quadrature_degree=1,
+    )
+
+
+def _gauss_points(batch: Batch, origin: Floats, axes: Floats) -> tuple[npt.NDArray[np.intp], Floats, Floats]:
+    """Return the Gauss points of the cells of a batch, cell by cell.
+
+    Args:
+        batch: The batch.
+        origin: Where its pieces begin in their cells, shape (num_pieces, 2).
+        axes: The edges of its pieces, shape (num_pieces, 2, 2).
+
+    Returns:
+        Of each point its piece in the batch, (n,), its coordinates there, (n, 2), and, in units of the piece's sides,
+        the side of the square whose area is its weight, (n,).
+    """
+    t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
+    t, w = (t + 1.0) / 2.0, w / 2.0
+    uv, weights = np.stack(np.meshgrid(t, t), axis=-1).reshape(-1, 2), np.outer(w, w).ravel()
+    area = np.abs(np.linalg.det(axes))
+    # Axes are orthogonal and of equal length: their inverse is the transpose over the area.
+    local = np.einsum("pji,pqj->pqi", axes, uv - origin[:, None]) / area[:, None, None]
+    piece, point = np.nonzero(((local > 0.0) & (local < 1.0)).all(axis=2))
+    assert piece.size == weights.size * batch.cells.size, "a Gauss point lies on an edge of pieces, or in none"
+    return piece, local[piece, point], np.sqrt(weights[point] / area[piece])
+
+
+def _restriction(centre: Floats, side: Floats) -> Floats:
+    """Return the matrices that take local B-spline coefficients of a polynomial to those on another square.
+
+    Args:
+        centre: Centres of the squares, shape (n, 2).
+        side: Their sides, shape (n,).
+
+    Returns:
+        Shape (n, 16, 16).
+    """
+    # Coefficient j of a cubic f is its polar form at the knots around it, f[j - 2, j - 1, j].
+    x, y, z = (centre[:, :, None] + side[:, None, None] * (np.arange(4) - shift - 0.5) for shift in (2, 1, 0))
+    polar = np.stack([np.ones_like(x), (x + y + z) / 3.0, (x * y + y * z + z * x) / 3.0, x * y * z], axis=-1)
+    along = polar @ (_TO_MONOMIALS_TIMES_6 / 6.0)
+    return np.einsum("njl,nik->njilk", along[:, 1], along[:, 0]).reshape(-1, 16, 16)
+
+
+@functools.cache
+def without_caps(depth: int) -> Callable[[Hierarchy], Cells]:
+    """Return the rule that cuts irregular elements down to a level and leaves out the sub-elements at the end.
+
+    Args:
+        depth: The level, or a deeper one where refinement goes deeper.
+
+    Raises:
+        ValueError: If the depth is less than 1.
+    """
+    if depth < 1:
+        raise ValueError(f"depth is {depth}; an irregular element must be cut at least once: give 1 or more")
+    return functools.partial(_capless_cells, depth=depth)
+
+
+def _capless_cells(hierarchy: Hierarchy, depth: int) -> Cells:
+    cells = extract(hierarchy.with_caps_at(depth))
+    kept = ~_caps(cells)
+    number = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
+    of_batches = np.split(kept, np.cumsum([batch.num_pieces for batch in cells.batches])[:-1])
+    return replace(
+        cells,
+        batches=tuple(_reduced(batch, mine) for batch, mine in zip(cells.batches, of_batches, strict=True)),
+        piece_origin=cells.piece_origin[kept],
+        piece_axes=cells.piece_axes[kept],
+        piece_of_face=tuple(np.where(faces >= 0, number[faces], -1) for faces in cells.piece_of_face),
+    )
+
+
+def _caps(cells: Cells) -> Bools:
+    """Return the pieces with an irregular vertex, shape (num_pieces,)."""
+    caps = np.zeros(cells.num_pieces, dtype=bool)
+    for stage, piece_of_face in zip(cells.hierarchy.stages, cells.piece_of_face, strict=True):
+        piece = piece_of_face[stage.level.touching(~stage.level.regular)]
+        caps[piece[piece >= 0]] = True
+    return caps
+
+
+def _reduced(batch: Batch, kept: Bools) -> Batch:
+    """Return the batch with some of its pieces; each cell keeps at least one."""
+    if batch.operators is None:
+        return batch
+    count = np.add.reduceat(kept, batch.offsets[:-1], dtype=np.int32)
+    return Batch(
+        cells=batch.cells,
+        dofs=batch.dofs,
+        offsets=np.concatenate([[0], np.cumsum(count)]).astype(np.int32),
+        nodes=batch.nodes[kept],
+        operators=batch.operators[kept],
+    )
