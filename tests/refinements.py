@@ -41,14 +41,14 @@ def refinements(name: str, rule: str, steps: list[list[Choice]]) -> list[Hierarc
     """The hierarchy of a mesh with nothing refined, and what each step makes of the one before."""
     hierarchies = [coarsest(name, rule)]
     for step in steps:
-        chosen = [_chosen(hierarchies[-1], *choice) for choice in step]
-        hierarchies.append(hierarchies[-1].refined(np.concatenate(chosen)))
+        dofs = [chosen(hierarchies[-1], *choice) for choice in step]
+        hierarchies.append(hierarchies[-1].refined(np.concatenate(dofs)))
     return hierarchies
 
 
-def _chosen(hierarchy: Hierarchy, place: str, finest: bool, number: int) -> np.ndarray:
-    """One of the dofs at a place that MAX_LEVELS allows to be refined; if none is there, one elsewhere, or none."""
-    levels = hierarchy.stages[: min(hierarchy.num_levels, MAX_LEVELS - 1)]
+def chosen(hierarchy: Hierarchy, place: str, finest: bool, number: int, most_levels: int = MAX_LEVELS) -> np.ndarray:
+    """One of the dofs at a place that `most_levels` allows to be refined; if none is there, one elsewhere, or none."""
+    levels = hierarchy.stages[: min(hierarchy.num_levels, most_levels - 1)]
     marks = np.concatenate([_at(place, stage)[stage.active] for stage in levels])
     if finest:
         marks[: hierarchy.dof_offsets[len(levels) - 1]] = False
@@ -127,6 +127,15 @@ class EdgePoints:
     regular: np.ndarray
 
 
+def regular_pieces(cells: Cells) -> np.ndarray:
+    """Marks of the pieces that are faces with four regular corners: the others are caps, or beside one."""
+    regular = np.zeros(cells.num_pieces, dtype=bool)
+    for stage, piece_of_face in zip(cells.hierarchy.stages, cells.piece_of_face, strict=True):
+        whole = np.flatnonzero(piece_of_face >= 0)
+        regular[piece_of_face[whole]] = stage.level.regular[stage.level.quads[whole]].all(axis=1)
+    return regular
+
+
 def edge_points(cells: Cells, per_side: int = 2, seed: int = 3) -> EdgePoints:
     """Random points on all edges between pieces; arrays of shape (2, n, ...), first the coarser or equal side.
 
@@ -134,10 +143,7 @@ def edge_points(cells: Cells, per_side: int = 2, seed: int = 3) -> EdgePoints:
     """
     rng = np.random.default_rng(seed)
     found = []
-    regular = np.zeros(cells.num_pieces, dtype=bool)
-    for stage, piece_of_face in zip(cells.hierarchy.stages, cells.piece_of_face, strict=True):
-        whole = np.flatnonzero(piece_of_face >= 0)
-        regular[piece_of_face[whole]] = stage.level.regular[stage.level.quads[whole]].all(axis=1)
+    regular = regular_pieces(cells)
     for m, (stage, piece_of_face) in enumerate(zip(cells.hierarchy.stages, cells.piece_of_face, strict=True)):
         level = stage.level
         side = np.flatnonzero(np.repeat(piece_of_face >= 0, 4) & ~level.rim)

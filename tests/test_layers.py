@@ -9,8 +9,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 LAYERS = """
     thccs_fem thccs_fem.jit thccs_fem.element thccs_fem.mesh
-    thccs_fem.subdivision thccs_fem.boundary thccs_fem.bezier thccs_fem.limit thccs_fem.generators
-    thccs_fem.hierarchy thccs_fem.extraction thccs_fem.folds
+    thccs_fem.subdivision thccs_fem.boundary thccs_fem.bezier thccs_fem.limit thccs_fem.generators thccs_fem.stam
+    thccs_fem.hierarchy thccs_fem.extraction thccs_fem.quadrature thccs_fem.folds
     thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.expression thccs_fem.fem.forms
     thccs_fem.fem.assembly thccs_fem.fem.bcs thccs_fem.fem.linear thccs_fem.fem.scipy
     thccs_fem.fem.project thccs_fem.fem thccs_fem.fem.petsc

@@ -60,7 +60,7 @@ def matrix(form: ufl.Form) -> sp.csr_array:
     return fem.assemble_matrix(fem.form(form))
 
 
-def without_rotations(A: Floats, dofs: npt.NDArray[np.int32]) -> Floats:
+def with_rows_of_the_identity(A: Floats, dofs: npt.NDArray[np.int32]) -> Floats:
     """Return A with rows and columns of dofs those of the identity, the slow way."""
     A = A.copy()
     for dof in dofs:
@@ -94,7 +94,7 @@ def test_rows_and_columns_become_those_of_the_identity() -> None:
     dofs = np.array([0, 7, 8, 59], dtype=np.int32)
     before, data = A.toarray(), A.data
     constrain(A, dofs)
-    np.testing.assert_array_equal(A.toarray(), without_rotations(before, dofs))
+    np.testing.assert_array_equal(A.toarray(), with_rows_of_the_identity(before, dofs))
     assert A.data is data
 
 
@@ -118,7 +118,7 @@ def test_the_system_is_that_of_its_free_dofs() -> None:
     A, b = matrix(a).toarray(), fem.assemble_vector(fem.form(L))
     np.testing.assert_allclose(system.b[free], b[free] - A[np.ix_(free, dofs)] @ values, rtol=1e-12, atol=1e-14)
     np.testing.assert_array_equal(system.b[dofs], values)
-    np.testing.assert_array_equal(system.A.toarray(), without_rotations(A, dofs))
+    np.testing.assert_array_equal(system.A.toarray(), with_rows_of_the_identity(A, dofs))
     assert system.constants is None
     assert system.regular() is system.A
 
@@ -136,7 +136,7 @@ def test_systems_are_assembled_anew_in_the_same_memory() -> None:
     assert system.A is A
     assert A.data is data
     assert system.b is b
-    np.testing.assert_allclose(A.toarray(), without_rotations(2 * first, np.array([3])), rtol=1e-14)
+    np.testing.assert_allclose(A.toarray(), with_rows_of_the_identity(2 * first, np.array([3])), rtol=1e-14)
     system.bcs = []
     system.assemble()
     np.testing.assert_allclose(A.toarray(), 2 * first, rtol=1e-14)

@@ -80,6 +80,31 @@ def test_children_of_a_function(valence):
 
 
 @pytest.mark.parametrize("valence", VALENCES)
+def test_coefficients_of_the_children(valence):
+    """Figure 6: products of the univariate coefficients at half edges from the vertex, but for its own."""
+    hierarchy = wheel(valence)
+    stage = hierarchy.refined(np.arange(hierarchy.num_dofs)).stages[0]
+    quads, step = stage.level.quads, stage.step
+    at_vertex = quads[(quads == 0).any(axis=1)]
+    around = set(at_vertex.ravel().tolist()) - {0}
+    beside = {int(face[(k + s) % 4]) for face in at_vertex for k in np.flatnonzero(face == 0) for s in (1, 3)}
+    c = (6 / 8, 4 / 8, 1 / 8)
+
+    def of_old(v: int) -> float:
+        return 1 - 7 / (4 * valence) if v == 0 else c[2] * c[0 if v in beside else 2] if v in around else 0.0
+
+    def of_edge(ends: set[int]) -> float:
+        return c[1] * c[0] if 0 in ends else c[2] * c[1] if ends <= around and ends & beside else 0.0
+
+    old = [of_old(v) for v in step.old.tolist()]
+    ends = np.stack([stage.level.vertices[step.edges], stage.level.vertices[stage.level.following[step.edges]]], axis=1)
+    edges = [of_edge(set(pair)) for pair in ends.tolist()]
+    faces = np.where((quads == 0).any(axis=1), c[1] * c[1], 0.0)
+    found = stage.matrix[:, [0]].toarray()[:, 0]
+    np.testing.assert_allclose(found, [*old, *edges, *faces], rtol=0, atol=1e-15)  # one of them is rounded
+
+
+@pytest.mark.parametrize("valence", VALENCES)
 @pytest.mark.parametrize(
     ("which", "discarded"),
     # Cases 1, 3 and 2 of section 4.2; one more further off.
@@ -111,10 +136,10 @@ def test_refining_the_irregular_function(valence):
 SIDE = 9  # vertices along a side of the grid
 
 
-def grid() -> SlowLevel:
-    quads = generators.rectangle((SIDE - 1, SIDE - 1)).quads
+def grid(columns: int = SIDE) -> SlowLevel:
+    quads = generators.rectangle((columns - 1, SIDE - 1)).quads
     counts = np.bincount(quads.ravel())
-    return whole_levels(quads, SIDE**2, np.flatnonzero(counts == 1), 1)[0]
+    return whole_levels(quads, counts.size, np.flatnonzero(counts == 1), 1)[0]
 
 
 def supported_inside(level: SlowLevel, fine: SlowLevel, refined: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -123,9 +148,9 @@ def supported_inside(level: SlowLevel, fine: SlowLevel, refined: list[int]) -> t
     return faces, ~fine.meeting(~np.repeat(faces, 4))
 
 
-def literal_sum(refined: list[int]) -> tuple[np.ndarray, np.ndarray]:
+def literal_sum(refined: list[int], columns: int = SIDE) -> tuple[np.ndarray, np.ndarray]:
     """The sum of all functions by the paper's letter, in those of level 1, and the marks of those inside Omega^1."""
-    level = grid()
+    level = grid(columns)
     matrix, fine = level.subdivided
     _, inside = supported_inside(level, fine, refined)
     children = (matrix[:, refined] > 0.0).any(axis=1)
@@ -134,8 +159,8 @@ def literal_sum(refined: list[int]) -> tuple[np.ndarray, np.ndarray]:
     return truncated.sum(axis=1) + children, inside  # activated: eq. (17)
 
 
-def package_sum(refined: list[int]) -> np.ndarray:
-    cells = extract(Hierarchy.on(generators.rectangle((SIDE - 1, SIDE - 1)), "crease").refined(np.array(refined)))
+def package_sum(refined: list[int], columns: int = SIDE) -> np.ndarray:
+    cells = extract(Hierarchy.on(generators.rectangle((columns - 1, SIDE - 1)), "crease").refined(np.array(refined)))
     return bernstein_rows(cells) @ np.ones(cells.num_dofs)
 
 
@@ -169,6 +194,15 @@ def test_the_hole_is_in_the_surface():
     rim = pairs[counts == 1]
     middles = [v for v in row if np.isin(rim, row).all(axis=1)[(rim == v).any(axis=1)].sum() == 2]
     assert len(middles) == 3  # of the five rim vertices in the hole, those with both neighbours in it
+
+
+def test_the_hole_is_there_between_refined_functions_too():
+    # Far from the rim; their supports have a side in common. What lives on both sides of it is nobody's child.
+    refined, columns = [4 + 13 * 4, 8 + 13 * 4], 13
+    total, inside = literal_sum(refined, columns)
+    assert np.count_nonzero(inside & (total == 0.0)) == 15
+    assert np.count_nonzero(inside) == 2 * 25 + 15
+    np.testing.assert_allclose(package_sum(refined, columns), 1.0, rtol=0, atol=1e-14)  # sums of 16 terms
 
 
 def test_children_alone_leave_functions_of_nothing():

@@ -249,6 +249,15 @@ def test_closed_surfaces(mesh: str, name: str) -> None:
     assert problem.A.getNullSpace().test(problem.A)
 
 
+def test_communicators_are_those_of_the_mesh() -> None:
+    if MPI.COMM_WORLD.size > 1:
+        pytest.skip("spaces are serial")
+    V = fem.functionspace(generators.torus((5, 4), comm=MPI.COMM_WORLD), ("THCCS", 3))
+    problem = LinearProblem(laplace(V), random_load(V), petsc_options_prefix="world_")
+    problem.solve()
+    assert problem.A.comm == problem.b.comm == problem.solver.comm == PETSc.COMM_WORLD
+
+
 @pytest.mark.parametrize("module", [petsc, scipy])
 def test_coefficients_may_be_finer(module: Any) -> None:
     # Integrals are then over finer cells than those of the unknown.

@@ -179,6 +179,20 @@ def test_lines_are_drawn_or_not(picture: Any) -> None:
     assert without.min() > 180
 
 
+def test_cells_are_drawn_by_their_values(picture: Any) -> None:
+    V = space(generators.l_domain(1))
+    level = V.cells.level
+    colours = {"clim": (0.0, 2.0), "cmap": ["#ff0000", "#00ff00", "#0000ff"]}
+    image = picture(V, cell_data={"level": level}, lines=False, **colours)
+    kind = np.where(image[:, :260].min(axis=2) > 0, -1, image[:, :260].argmax(axis=2))  # the rest is for the bar
+    area = np.bincount(level, weights=0.25**level, minlength=3)  # of cells that are squares
+    seen = np.bincount(kind[kind >= 0], minlength=3)
+    np.testing.assert_allclose(seen / seen.sum(), area / area.sum(), atol=0.02)
+    assert (picture(V, cell_data={"level": level}, **colours) != image).any()
+    u = some_function(V)
+    np.testing.assert_array_equal(picture(u, cell_data={"level": level}), picture(V, cell_data={"level": level}))
+
+
 def test_vectors_are_drawn_by_magnitude(picture: Any) -> None:
     mesh = ZOO["torus"]()
     d = some_function(space(mesh, (2,)), "d")
@@ -269,6 +283,15 @@ def test_what_can_not_be_drawn(tmp_path: Path, picture: Any) -> None:
     for clim in ((1.0, 1.0), (2.0, 1.0), (0.0, np.inf), (np.nan, 1.0)):
         with pytest.raises(ValueError, match=r"clim is .*; expected two finite numbers, the lower one first"):
             picture(u, clim=clim)
+    V = u.function_space
+    eta = np.ones(V.num_cells)
+    with pytest.raises(ValueError, match=r"have the names \['a', 'b'\]: a picture can show one"):
+        plot.plot(V, tmp_path / "u.png", cell_data={"a": eta, "b": eta})
+    with pytest.raises(ValueError, match=r"'eta' must be one number for each of the \d+ cells"):
+        plot.plot(V, tmp_path / "u.png", cell_data={"eta": eta[1:]})
+    eta[3] = 0.0
+    with pytest.warns(RuntimeWarning), pytest.raises(ValueError, match=r"'eta' of cell 3 are -inf: give finite values"):
+        plot.plot(V, tmp_path / "u.png", cell_data={"eta": np.log10(eta)})
     u.x.array[:2] = np.nan, np.inf
     with pytest.raises(
         ValueError, match=rf"2 of the {u.x.array.size} coefficients of 'u' are infinite or not a number"

@@ -72,7 +72,7 @@ def _face_corner_points(level: Level, num_functions: int) -> sp.csr_array:
 
 
 def _averages(level: Level, half_edges: Ints) -> sp.csr_array:
-    """Return the means of I that are no boundary rows, in the order of `bezier_masks`, shape (4 * n, num_half_edges)."""
+    """Return the means of I that are no boundary rows, shape (4 * n, num_half_edges); for `bezier_masks`."""
     row = 4 * np.arange(half_edges.size)
     previous = level.previous[half_edges]
     across, across_previous = level.twins[half_edges], level.twins[previous]

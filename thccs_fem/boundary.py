@@ -255,8 +255,8 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
 def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:
     """Return the trace functions whose support meets the marked faces, shape (num_traces,).
 
-    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2; of a corner's q10 and q01 those of the
-    two edges along its rim; of q00 its one face.
+    The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2; of a corner's q10 and q01 those of
+    the two edges along its rim; of q00 its one face.
     """
     level = boundary.level
     a, b, hit = _rim_edges(level, faces)

@@ -1,4 +1,4 @@
-"""Error indicators, one a cell: the exact error, and the residual of the strong form.
+"""Error indicators, one a cell: the exact error, the residual of the strong form, and local problems on bubbles.
 
 Indicators are not squared; `norm` sums them up.
 """
@@ -12,12 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
-from thccs_fem.fem.assembly import assemble_cells
-from thccs_fem.fem.forms import form
+from thccs_fem.fem.assembly import assemble_cells, bubble_energies
+from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
+from ufl.algorithms import apply_algebra_lowering, apply_derivatives
+from ufl.corealg.traversal import unique_pre_traversal
 
-__all__ = ["error", "norm", "residual"]
+__all__ = ["bubble", "error", "norm", "residual"]
 
 Floats = npt.NDArray[np.float64]
 QUADRATURE_DEGREE = 11  # 6 x 6 Gauss points: the error is no polynomial
@@ -76,6 +78,73 @@ def residual(uh: Function, strong_residual: ufl.core.expr.Expr, neumann: ufl.cor
     return np.sqrt(_over_cells(V, ufl.as_ufl(1.0)) * np.maximum(squares, 0.0))
 
 
+def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
+    """Return the bubble indicators: the energy norms of the error's projections onto four bubble functions a cell.
+
+    In each cell (and with a mixed a in all components together) the local problem for a combination z of bubbles is
+
+        a(z, b) = L(b) - a(uh, b)    for all bubbles b of the cell,        eta^2 = |a(z, z)|,
+
+    the problem that uh solves, as it was written, with its quadrature. Bubbles are the bicubic Bernstein polynomials of
+    the cell that vanish on its edges: they are continuous, but not in the space, which is smoother. An irregular cell
+    has four as well, over all its pieces.
+
+    If a is symmetric and positive definite, eta is at most the energy norm of the error in the cell, up to quadrature;
+    what it misses is the part of the error that lives on the edges. It is an indicator for second-order equations
+    in a coercive form: of a pure advection a(z, z) is zero.
+
+    Args:
+        uh: The approximation; the indicators belong to its cells.
+        a: Bilinear form in trial and test functions of the space of uh.
+        L: Linear form in a test function of that space. Boundary integrals of v do not see bubbles: leave them out.
+
+    Returns:
+        Shape (num_cells,), local.
+
+    Raises:
+        ValueError: If forms and uh have different spaces, functions on finer cells, or second derivatives of the test
+            function; or the local problem of a cell has no solution.
+    """
+    V, a, L = uh.function_space, form(a), form(L)
+    _check_problem(V, a, L)
+    squares = np.abs(bubble_energies(a, L, uh))
+    singular = np.flatnonzero(np.isinf(squares))
+    if singular.size:
+        raise ValueError(
+            f"the local problems of {singular.size} cells have no solution, the first that of cell {singular[0]} on "
+            f"face {V.cells.face[singular[0]]} of the control mesh: L has an integral over it, or one of a component, "
+            f"that a has none of, or coefficients are zero or so large that they overflow"
+        )
+    return np.sqrt(squares)
+
+
+def _check_problem(V: FunctionSpace, a: Form, L: Form) -> None:
+    if (a.rank, L.rank) != (2, 1):
+        raise ValueError(f"a and L have {a.rank} and {L.rank} arguments; the bilinear form has 2, the linear form 1")
+    if any(space != V for space in (*a.spaces, *L.spaces)):
+        raise ValueError(
+            f"uh is in {V}, but the arguments of a are in {a.spaces[1]} and {a.spaces[0]} and that of L in "
+            f"{L.spaces[0]}: give the forms that uh solves, with TrialFunction(V) and TestFunction(V) of its space"
+        )
+    for given in (a, L):
+        if not given.hierarchy.same_as(V.hierarchy):
+            raise ValueError("a or L has functions on a refinement of the cells that indicators are wanted for")
+        if _has_second_derivatives(given):
+            raise ValueError(
+                "a or L has second derivatives of the test function, but bubbles are not smooth enough across edges "
+                "for fourth-order equations: use estimate.residual"
+            )
+
+
+def _has_second_derivatives(given: Form) -> bool:
+    """Return whether the test function is differentiated more than once."""
+    lowered = apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(given.ufl_form))
+    test = lowered.arguments()[0]
+    nodes = (node for part in lowered.integrals() for node in unique_pre_traversal(part.integrand()))
+    once = ufl.grad(test)
+    return any(isinstance(node, ufl.classes.Grad) and node.ufl_operands[0] == once for node in nodes)
+
+
 def norm(V: FunctionSpace, eta: Floats) -> float:
     """Return the root of the sum of the squared indicators, over all ranks."""
     return float(np.sqrt(np.sum(np.asarray(eta) ** 2)))
@@ -100,6 +169,6 @@ def _over_cells(V: FunctionSpace, density: ufl.core.expr.Expr) -> Floats:
         ValueError: If the density has functions on finer cells than those of V.
     """
     compiled = form(density * ufl.dx(domain=V.mesh.ufl_domain()), quadrature_degree=QUADRATURE_DEGREE, on=V)
-    if compiled.cells is not V.cells:
+    if compiled.cells is not V.integration_cells:
         raise ValueError("the expression has functions on a refinement of the cells that indicators are wanted for")
     return assemble_cells(compiled)

@@ -224,7 +224,7 @@ def implicit_surface(
 
     >>> ball = implicit_surface(lambda x: 0.8 - (x**2).sum(axis=0), (20, 20, 20))
     >>> ball.euler_characteristic, ball.num_faces, len(ball.extraordinary_vertices)
-    (2, 1110, 440)
+    (2, 1296, 560)
     """
     counts, low, high = _lattice_box(shape, lower, upper)
     _check_count("smoothing", smoothing, minimum=0)
@@ -257,15 +257,13 @@ def _filled(values: Floats) -> Floats:
         raise ValueError("f is positive at no point of the lattice: there is no surface. Give more points, or -f")
     if inside.sum() > inside[1:-1, 1:-1, 1:-1].sum():
         raise ValueError("f is positive on the sides of the box: the surface would be cut off. Give a larger box")
-    count = 0
-    while count != (count := np.count_nonzero(inside)):
-        for block in ((1, 2, 2), (2, 1, 2), (2, 2, 1), (2, 2, 2)):
-            _fill_diagonals(inside, block)
+    while any([_fill_diagonals(inside, block) for block in ((1, 2, 2), (2, 1, 2), (2, 2, 1), (2, 2, 2))]):
+        pass
     return np.where(inside, 1.0, -1.0) * np.maximum(np.abs(values), np.finfo(np.float64).tiny)
 
 
-def _fill_diagonals(inside: Bools, block: tuple[int, int, int]) -> None:
-    """Fill, in place, the blocks of a lattice where a diagonal has one sign and the rest the other."""
+def _fill_diagonals(inside: Bools, block: tuple[int, int, int]) -> bool:
+    """Fill, in place, the blocks of a lattice where a diagonal has one sign and the rest the other; say if any."""
     size = [n - k + 1 for n, k in zip(inside.shape, block, strict=True)]
     corners = list(itertools.product(*map(range, block)))
     parts = [inside[tuple(slice(o, o + n) for o, n in zip(c, size, strict=True))] for c in corners]
@@ -275,6 +273,7 @@ def _fill_diagonals(inside: Bools, block: tuple[int, int, int]) -> None:
         critical |= (one & other & (total == 2)) | (~one & ~other & (total == len(parts) - 2))
     for part in parts:
         part |= critical
+    return bool(critical.any())
 
 
 def _surface_net(values: Floats) -> tuple[Floats, Ints]:

@@ -1,5 +1,6 @@
 /* All loops of the project that numpy can't do over all cells at once. Compiled by jit.library(). */
 
+#include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -278,6 +279,171 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
   }
   free(memory);
   return 0;
+}
+
+/* ---- Local problems -------------------------------------------------------------------------------------------- */
+
+enum { BUBBLES = 4 }; /* of a cell: products of the cubic Bernstein polynomials 1 and 2, the first along x fastest */
+
+/* Their local B-spline coefficients (16, 4) on a piece, which begins at origin in its cell and has edges u and v
+   there, the columns of axes: one of them along x, the other along y. */
+static void bubbles_on_piece(const double *origin, const double *axes, double *bubbles)
+{
+  double factors[2][4][2]; /* along x and along y */
+  for (int d = 0; d < 2; ++d)
+    for (int i = 0; i < 4; ++i) {
+      /* Coefficient i is the polar form at the knots i - 2, i - 1 and i of the piece. */
+      const double step = axes[2 * d] + axes[2 * d + 1], t = origin[d] + step * (i - 1), s = t - step, r = t + step;
+      const double sum = r + s + t, pairs = r * s + s * t + t * r, product = r * s * t;
+      factors[d][i][0] = sum - 2.0 * pairs + 3.0 * product; /* of 3 x (1 - x)^2 */
+      factors[d][i][1] = pairs - 3.0 * product;             /* of 3 x^2 (1 - x) */
+    }
+  const int is_turned = fabs(axes[1]) > fabs(axes[0]);
+  for (int j = 0; j < 4; ++j)
+    for (int i = 0; i < 4; ++i)
+      for (int m = 0; m < BUBBLES; ++m)
+        bubbles[(i + 4 * j) * BUBBLES + m] = factors[0][is_turned ? j : i][m % 2] * factors[1][is_turned ? i : j][m / 2];
+}
+
+/* residual (4, bs) += b^T tensor, and with coefficients (16, bs) for which tensor is a matrix: matrix (4, bs, 4, bs)
+   += b^T tensor b and residual -= b^T tensor coefficients. */
+static inline __attribute__((always_inline)) void add_on_bubbles(int32_t bs, const double *restrict b,
+                                                                 const double *restrict tensor,
+                                                                 const double *restrict coefficients,
+                                                                 double *restrict matrix, double *restrict residual)
+{
+  for (int32_t i = 0; i < LOCAL; ++i)
+    for (int32_t r = 0; r < bs; ++r) {
+      double value = 0.0;
+      if (!coefficients)
+        value = tensor[i * bs + r];
+      else
+        for (int32_t c = 0; c < bs; ++c) {
+          const double *row = tensor + (int64_t)(i * bs + r) * LOCAL * bs + c;
+          double sum[BUBBLES] = {0.0};
+          for (int32_t j = 0; j < LOCAL; ++j) {
+            value -= row[j * bs] * coefficients[j * bs + c];
+            for (int n = 0; n < BUBBLES; ++n)
+              sum[n] += row[j * bs] * b[BUBBLES * j + n];
+          }
+          for (int m = 0; m < BUBBLES; ++m)
+            for (int n = 0; n < BUBBLES; ++n)
+              matrix[(m * bs + r) * BUBBLES * bs + n * bs + c] += b[BUBBLES * i + m] * sum[n];
+        }
+      for (int m = 0; m < BUBBLES; ++m)
+        residual[m * bs + r] += b[BUBBLES * i + m] * value;
+    }
+}
+
+int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                              const double *origins, const double *axes, const double *coefficients,
+                              double *matrices, double *residuals)
+{
+  workspace work;
+  const int32_t bs = block_size;
+  const int64_t columns = coefficients ? LOCAL * bs : 1, n = BUBBLES * bs;
+  void *memory = make_workspace(&work, batch, integral, coefficients ? bs * bs : bs);
+  if (!memory)
+    return -1;
+  for (int32_t i = 0; i < integral->num_cells; ++i) {
+    const int32_t k = chosen(integral, i);
+    double *matrix = matrices + n * n * batch->cells[k], *residual = residuals + n * batch->cells[k];
+    gather_coefficients(integral, batch->width, batch->dofs + (int64_t)batch->width * k, work.cell_coefficients);
+    for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
+      double b[LOCAL * BUBBLES];
+      const double *c = coefficients ? coefficients + LOCAL * bs * piece : NULL;
+      bubbles_on_piece(origins + 2 * piece, axes + 4 * piece, b);
+      integrate_piece(batch, integral, piece, LOCAL * bs * columns, &work);
+      if (bs == 1)
+        add_on_bubbles(1, b, work.piece_tensor, c, matrix, residual);
+      else
+        add_on_bubbles(bs, b, work.piece_tensor, c, matrix, residual);
+    }
+  }
+  free(memory);
+  return 0;
+}
+
+/* Pivots and remainders that are but rounding, where the largest entry of each row is 1. */
+static const double SINGULAR = 1e-13, REMAINDER = 1e-10;
+
+static void swap(double *a, double *b)
+{
+  const double c = *a;
+  *a = *b;
+  *b = c;
+}
+
+/* Make the largest entry of each row 1. Return the largest right-hand side then, or NaN where one entry is not finite. */
+static double scale_rows(int32_t n, double *a, double *b)
+{
+  double finite = 0.0, largest_side = 0.0;
+  for (int32_t i = 0; i < n; ++i) {
+    double largest = 0.0;
+    for (int32_t j = 0; j < n; ++j) {
+      finite += 0.0 * a[n * i + j];
+      largest = largest < fabs(a[n * i + j]) ? fabs(a[n * i + j]) : largest;
+    }
+    if (largest > 0.0) {
+      for (int32_t j = 0; j < n; ++j)
+        a[n * i + j] /= largest;
+      b[i] /= largest;
+    }
+    finite += 0.0 * b[i];
+    largest_side = largest_side < fabs(b[i]) ? fabs(b[i]) : largest_side;
+  }
+  return largest_side + finite;
+}
+
+/* Bring the largest of the entries from (s, s) on there, and return its size. */
+static double pivot(int32_t n, int32_t s, double *a, double *b, double *r)
+{
+  int32_t p = s, q = s;
+  for (int32_t i = s; i < n; ++i)
+    for (int32_t j = s; j < n; ++j)
+      if (fabs(a[n * i + j]) > fabs(a[n * p + q]))
+        p = i, q = j;
+  for (int32_t j = 0; j < n; ++j)
+    swap(a + n * s + j, a + n * p + j);
+  for (int32_t i = 0; i < n; ++i)
+    swap(a + n * i + s, a + n * i + q);
+  swap(b + s, b + p);
+  swap(r + s, r + q);
+  return fabs(a[n * s + s]);
+}
+
+/* r^T z with a z = b: Gauss' elimination, rows and columns pivoted. All of a, b and r is written over. */
+static double solved(int32_t n, double *a, double *b, double *r)
+{
+  const double largest = scale_rows(n, a, b);
+  if (isnan(largest))
+    return NAN;
+  int32_t rank = 0;
+  for (; rank < n && pivot(n, rank, a, b, r) > SINGULAR; ++rank)
+    for (int32_t i = rank + 1; i < n; ++i) {
+      const double factor = a[n * i + rank] / a[n * rank + rank];
+      for (int32_t j = rank + 1; j < n; ++j)
+        a[n * i + j] -= factor * a[n * rank + j];
+      b[i] -= factor * b[rank];
+    }
+  for (int32_t i = rank; i < n; ++i)
+    if (fabs(b[i]) > REMAINDER * largest)
+      return INFINITY;
+  double product = 0.0;
+  for (int32_t i = rank - 1; i >= 0; --i) {
+    for (int32_t j = i + 1; j < rank; ++j)
+      b[i] -= a[n * i + j] * b[j];
+    b[i] /= a[n * i + i];
+    product += r[i] * b[i];
+  }
+  return product;
+}
+
+void thccs_solve_local(int32_t num_cells, int32_t n, double *matrices, double *residuals, double *again,
+                       double *values)
+{
+  for (int64_t k = 0; k < num_cells; ++k)
+    values[k] = solved(n, matrices + n * n * k, residuals + n * k, again + n * k);
 }
 
 /* ---- Sparsity pattern ------------------------------------------------------------------------------------------ */

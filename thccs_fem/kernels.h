@@ -28,7 +28,7 @@ typedef struct {
   const int32_t *cells;                /* (num_cells) positions in the batch, or NULL: 0 .. num_cells */
 } thccs_integral;
 
-/* These three return 0, or -1 when there is no memory. */
+/* These four return 0, or -1 when there is no memory. */
 
 /* values[cell] += integral over the cell. */
 int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values);
@@ -44,6 +44,20 @@ int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integr
 int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
                           const int32_t *indptr, const int64_t *starts, int32_t position_size,
                           const void *positions, double *values);
+
+/* Local problems on four bubble functions a cell: products of the inner cubic Bernstein polynomials. Pieces lie in
+   their cells at origins (pieces, 2), along axes (pieces, 2, 2). Of a linear form, with coefficients NULL: residuals
+   (cells, 4 * block_size) += form of the bubbles. Of a bilinear form, with local coefficients (pieces, 16, block_size)
+   of a function: matrices (cells, 4 * block_size, 4 * block_size) += form of them, residuals -= form of function and
+   them. */
+int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                              const double *origins, const double *axes, const double *coefficients,
+                              double *matrices, double *residuals);
+
+/* values[cell] = r^T z with matrix (n, n) z = r, r the residual (n), given twice: all three are written over. Infinite
+   where there is no z, NaN where an entry is not finite. A z that is not unique is 0 where nothing determines it. */
+void thccs_solve_local(int32_t num_cells, int32_t n, double *matrices, double *residuals, double *again,
+                       double *values);
 
 /* Which dofs share a cell. First with indices NULL and next 0: next[i] becomes the length of row i. Then with next[i]
    the beginning of row i: its columns are written, in order. seen (num_dofs) is -1 before each call. */

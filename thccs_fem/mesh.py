@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 import ufl
 from thccs_fem import element
 
-__all__ = ["ControlMesh", "orient"]
+__all__ = ["ControlMesh", "end_faces", "orient"]
 
 type Bools = npt.NDArray[np.bool_]
 type Floats = npt.NDArray[np.float64]
@@ -258,10 +258,15 @@ class ControlMesh:
         return dict(zip(vertices.tolist(), self.valences[vertices].tolist(), strict=True))
 
     @cached_property
-    def num_invalid_faces(self) -> int:
-        """Number of faces with two or more interior extraordinary vertices ("invalid elements")."""
+    def invalid_faces(self) -> Ints:
+        """Faces with two or more interior extraordinary vertices ("invalid elements"), ascending."""
         extraordinary = self._is_extraordinary[self.face_vertices].astype(np.int32)
-        return int((np.add.reduceat(extraordinary, self.face_offsets[:-1]) >= 2).sum())
+        return _read_only(np.flatnonzero(np.add.reduceat(extraordinary, self.face_offsets[:-1]) >= 2))
+
+    @property
+    def num_invalid_faces(self) -> int:
+        """Number of `invalid_faces`."""
+        return int(self.invalid_faces.size)
 
     @cached_property
     def vertex_components(self) -> Ints:
@@ -429,6 +434,45 @@ def orient(vertices: npt.ArrayLike, faces: Faces) -> Ints | list[list[int]]:
     if (oriented.sizes == oriented.sizes[0]).all():
         return oriented.vertices.reshape(oriented.num_faces, -1)
     return [face.tolist() for face in np.split(oriented.vertices, oriented.offsets[1:-1])]
+
+
+def end_faces(mesh: ControlMesh, share: float = 0.02) -> tuple[Ints, Ints]:
+    """Find the faces at both ends of a mesh: regions for conditions on a surface that has no tags.
+
+    In each connected component these are the faces whose centres come first and last along its
+    longest axis (the first principal one, in the direction of its largest coordinate).
+
+    Args:
+        mesh: The mesh.
+        share: Part of the faces of a component at either end, at most a half; at least one face.
+
+    Returns:
+        The faces at the one end and at the other, ascending.
+
+    Raises:
+        ValueError: share is not in (0, 1/2], or a component has a single face.
+
+    >>> from thccs_fem.generators import rectangle
+    >>> [faces.tolist() for faces in end_faces(rectangle((5, 2)), share=0.2)]
+    [[0, 5], [4, 9]]
+    """
+    if not 0.0 < share <= 0.5:
+        raise ValueError(f"share is {share}: expected a part of the faces at either end, in (0, 1/2]")
+    face = np.repeat(np.arange(mesh.num_faces), mesh.face_sizes)
+    sums = [np.bincount(face, weights=x) for x in mesh.vertices[mesh.face_vertices].T]
+    centres = np.column_stack(sums) / mesh.face_sizes[:, None]
+    component = mesh.vertex_components[mesh.face_vertices[mesh.face_offsets[:-1]]]
+    ends = []
+    for faces in np.split(np.argsort(component, kind="stable"), np.cumsum(np.bincount(component))[:-1]):
+        if faces.size < 2:
+            raise ValueError(f"face {faces[0]} is a component of its own: it has no two ends")
+        x = centres[faces] - centres[faces].mean(axis=0)
+        axis = np.linalg.svd(x, full_matrices=False)[2][0]
+        order = faces[np.argsort(x @ axis * np.sign(axis[np.abs(axis).argmax()]), kind="stable")]
+        count = max(1, int(share * faces.size))
+        ends.append((order[:count], order[-count:]))
+    first, last = (_read_only(np.sort(np.concatenate(end))) for end in zip(*ends, strict=True))
+    return first, last
 
 
 @dataclass(frozen=True, eq=False)

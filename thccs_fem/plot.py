@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
-from thccs_fem.vtk import cell_numbers, in_space
+from thccs_fem.vtk import cell_numbers, in_space, one_for_each_cell
 
 if TYPE_CHECKING:  # imported where it is needed: it takes its time
     import pyvista
@@ -54,6 +55,7 @@ def plot(
     uh: Function | FunctionSpace,
     filename: str | os.PathLike[str] | None = None,
     *,
+    cell_data: Mapping[str, npt.ArrayLike] | None = None,
     camera: Any = None,
     clim: Sequence[float] | None = None,
     cmap: Any = "viridis",
@@ -66,6 +68,8 @@ def plot(
     Args:
         uh: A function (of one with vector values the magnitude is drawn), or a space.
         filename: PNG file to write, also on a machine without a display; None opens a window.
+        cell_data: Colour the elements by this instead: one name and the values for each of them, such as estimates, of
+            shape (num_cells,). On a scale of powers of ten: {"log10 of the error": np.log10(eta)}.
         camera: Camera position as PyVista takes it: "xy", "iso", ..., a direction towards the viewer, or (position,
             focal point, up). By default planar surfaces are seen from above, others obliquely with z upwards.
         clim: Values at the ends of the colour map; by default the least and the largest there are.
@@ -77,13 +81,15 @@ def plot(
 
     Raises:
         TypeError: If `uh` is neither function nor space.
-        ValueError: If the file is not called .png, the function has values that are not finite or can not warp the
-            surface, or `clim` is no interval.
+        ValueError: If the file is not called .png, the function or cell data have values that are not finite, cell data
+            have more than one name or not one value for each element, the function can not warp the surface, or `clim`
+            is no interval.
         OSError: If the file cannot be written, or there is nothing to draw on.
     """
     import pyvista
 
     path = None if filename is None else _checked(Path(filename))
+    shown = _shown(uh, cell_data)
     facets, sides = surface(uh, warp=warp), mesh_lines(uh, warp=warp) if lines else None
     with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
         plotter: Any = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
@@ -91,11 +97,11 @@ def plot(
         _check_there_is_something_to_draw_on(plotter)
         plotter.set_background("white")
         plotter.enable_anti_aliasing("ssaa")
-        if isinstance(uh, Function):
-            _draw_function(plotter, uh, facets, sides, clim, cmap)
-        else:
+        if shown is None:
             _draw(plotter, facets, sides, {"color": PLAIN}, {"color": INK})
-        _set_camera(plotter, facets.points, camera, BAR if isinstance(uh, Function) else 0.0)
+        else:
+            _draw_coloured(plotter, shown, facets, sides, clim, cmap)
+        _set_camera(plotter, facets.points, camera, 0.0 if shown is None else BAR)
         if path is None:
             plotter.show()
         else:
@@ -147,6 +153,8 @@ def surface(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyD
 def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyData:
     """Return the sides of the elements as lines along the facets of `surface`; elements share no lines.
 
+    Point data are the function, by its name; cell data the number "cell" of the element.
+
     Args:
         uh: The function, or a space.
         warp: As for `plot`.
@@ -158,7 +166,7 @@ def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.Po
 
     cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
     outer = _on_cell_boundary(cells)
-    points, sampled, lines = [], [], []
+    points, sampled, lines, cell = [], [], [], []
     num_points = 0
     for n, pieces in _by_segments(points_of_pieces, values):
         piece, side = np.nonzero(outer[pieces])
@@ -167,9 +175,11 @@ def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.Po
         sampled.append((on_sides @ values[pieces[piece]]).reshape(-1, values.shape[2]))
         number = num_points + np.arange(len(points[-1])).reshape(-1, n + 1)
         lines.append(np.insert(number, 0, n + 1, axis=1).ravel())
+        cell.append(cells.piece_cell[pieces[piece]])
         num_points += number.size
     mesh = pyvista.PolyData(in_space(np.concatenate(points)), lines=np.concatenate(lines))
     _add_values(mesh, uh, np.concatenate(sampled))
+    mesh.cell_data["cell"] = np.concatenate(cell)
     return mesh
 
 
@@ -289,27 +299,59 @@ def _check_there_is_something_to_draw_on(plotter: pyvista.Plotter) -> None:
         )
 
 
-def _draw_function(
+@dataclass(frozen=True)
+class _Shown:
+    """What colours stand for: its name, and values at the points of facets or lines, or for these themselves."""
+
+    title: str
+    values: Callable[[pyvista.PolyData], Floats]
+    of_cells: bool
+
+    def add_to(self, drawn: pyvista.PolyData) -> Floats:
+        values = self.values(drawn)
+        (drawn.cell_data if self.of_cells else drawn.point_data)[SHOWN] = values
+        return values
+
+
+def _shown(uh: Function | FunctionSpace, cell_data: Mapping[str, npt.ArrayLike] | None) -> _Shown | None:
+    """Return what is to be shown on the elements; None for nothing."""
+    cells, _ = _cells_and_values(uh)
+    if cell_data is not None:
+        if len(cell_data) != 1:
+            raise ValueError(f"cell data have the names {list(cell_data)}: a picture can show one; give that")
+        ((name, given),) = cell_data.items()
+        values = one_for_each_cell(cells, name, given).astype(np.float64)
+        if not np.isfinite(values).all():
+            first = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise ValueError(f"cell data {name!r} of cell {first} are {values[first]}: give finite values")
+        return _Shown(name, lambda drawn: values[drawn.cell_data["cell"]], of_cells=True)
+    if isinstance(uh, FunctionSpace):
+        return None
+    title = f"magnitude of {uh.name}" if uh.function_space.value_shape else uh.name
+    return _Shown(title, lambda drawn: _magnitude(drawn.point_data[uh.name]), of_cells=False)
+
+
+def _draw_coloured(
     plotter: pyvista.Plotter,
-    uh: Function,
+    shown: _Shown,
     facets: pyvista.PolyData,
     sides: pyvista.PolyData | None,
     clim: Sequence[float] | None,
     cmap: Any,
 ) -> None:
-    """Draw a surface coloured by a function, and lines that stand out on these colours."""
+    """Draw a surface with colours that stand for values, and lines that stand out on these colours."""
     import pyvista
 
-    value = facets.point_data[SHOWN] = _magnitude(facets.point_data[uh.name])
+    value = shown.add_to(facets)
     low, high = _range(value) if clim is None else _checked_range(clim)
     table = pyvista.LookupTable(cmap, scalar_range=(low, high))
+    preference = "cell" if shown.of_cells else "point"
     line_colours = {}
     if sides is not None:
-        on_sides = table(_magnitude(sides.point_data[uh.name]))
-        line_colours = {"scalars": _standing_out(on_sides), "rgb": True}
-    colours = {"scalars": SHOWN, "cmap": table, "show_scalar_bar": False}
+        line_colours = {"scalars": _standing_out(table(shown.values(sides))), "rgb": True, "preference": preference}
+    colours = {"scalars": SHOWN, "cmap": table, "show_scalar_bar": False, "preference": preference}
     actor = _draw(plotter, facets, sides, colours, line_colours)
-    _add_bar(plotter, actor.mapper, f"magnitude of {uh.name}" if uh.function_space.value_shape else uh.name, low, high)
+    _add_bar(plotter, actor.mapper, shown.title, low, high)
 
 
 def _draw(

@@ -50,34 +50,37 @@ def paper_cells(hierarchy: Hierarchy) -> Cells:
         hierarchy: The hierarchy.
     """
     cells = extract(hierarchy.with_caps_at(max(hierarchy.cap_level, hierarchy.num_levels - 1 + DEPTH)))
-    ends = np.cumsum([batch.num_pieces for batch in cells.batches])
-    batches, points, origins, axes = [], [], [], []
-    for batch, end in zip(cells.batches, ends, strict=True):
-        mine = slice(end - batch.num_pieces, end)
-        piece, centre, side = _gauss_points(batch, cells.piece_origin[mine], cells.piece_axes[mine])
+    first = np.cumsum([0, *(batch.num_pieces for batch in cells.batches)])
+    batches: list[Batch] = []
+    pieces, points, corners, sides = [], [], [], []
+    for batch, begin, end in zip(cells.batches, first[:-1], first[1:], strict=True):
+        piece, centre, side = _gauss_points(batch, cells.piece_origin[begin:end], cells.piece_axes[begin:end])
         restriction = _restriction(centre, side)
-        first_node = 16 * sum(map(len, points))
-        batches.append(
-            Batch(
-                cells=batch.cells,
-                dofs=batch.dofs,
-                offsets=np.arange(0, piece.size + 1, NUM_GAUSS**2, dtype=np.int32),
-                nodes=(first_node + np.arange(16 * piece.size)).reshape(-1, 16).astype(np.int32),
-                operators=restriction if batch.operators is None else restriction @ batch.operators[piece],
-            )
-        )
-        points.append(restriction @ cells.piece_points[mine][piece])
-        axes.append(cells.piece_axes[mine][piece] * side[:, None, None])
-        corner = centre - side[:, None] / 2.0
-        origins.append(cells.piece_origin[mine][piece] + np.einsum("nij,nj->ni", cells.piece_axes[mine][piece], corner))
+        batches.append(_gauss_batch(batch, NUM_GAUSS**2 * sum(b.cells.size for b in batches), piece, restriction))
+        points.append(restriction @ cells.piece_points[begin + piece])
+        pieces.append(begin + piece)
+        corners.append(centre - side[:, None] / 2.0)
+        sides.append(side)
+    origin, axes = (a[np.concatenate(pieces)] for a in (cells.piece_origin, cells.piece_axes))
     return replace(
         cells,
         points=np.concatenate(points).reshape(-1, cells.points.shape[1]),
         batches=tuple(batches),
-        piece_origin=np.concatenate(origins),
-        piece_axes=np.concatenate(axes),
+        piece_origin=origin + np.einsum("nij,nj->ni", axes, np.concatenate(corners)),
+        piece_axes=axes * np.concatenate(sides)[:, None, None],
         piece_of_face=tuple(np.full_like(faces, -1) for faces in cells.piece_of_face),
         quadrature_degree=1,
+    )
+
+
+def _gauss_batch(batch: Batch, num_before: int, piece: npt.NDArray[np.intp], restriction: Floats) -> Batch:
+    """Return the batch with a piece for each Gauss point, given the number of points in the batches before."""
+    return Batch(
+        cells=batch.cells,
+        dofs=batch.dofs,
+        offsets=np.arange(0, piece.size + 1, NUM_GAUSS**2, dtype=np.int32),
+        nodes=np.arange(16 * num_before, 16 * (num_before + piece.size), dtype=np.int32).reshape(-1, 16),
+        operators=restriction if batch.operators is None else restriction @ batch.operators[piece],
     )
 
 

@@ -14,12 +14,12 @@ One subdivision takes the K control points of the element to those of its child 
 16 of each of its three other, regular, children.  So a point in (0, 2^-m]^2 asks for A^m: with A = V L V^-1 that costs
 no more than powers of numbers, however near to the vertex the point is.
 
-The eigenstructure comes from symmetric problems alone.  A is block lower triangular: the ring (2 N + 1), the arms (3 and
-3) and the corner (1).  Each block is symmetric in the inner product of its limit mask (weights N^2, 4, 1 on the ring,
-1, 4, 1 on an arm), so `eigh` gives all eigenvalues, real, with orthogonal vectors, for multiple eigenvalues too.  What
-remains is to continue the vectors of one block into the next, by division by the difference of eigenvalues.  These
-differ, but for 1/8, which the ring shares with the arms where N is a multiple of 4; there the numerator vanishes as
-well: A has no Jordan block for any N >= 3.
+The eigenstructure comes from symmetric problems alone.  A is block lower triangular: the vertex and its ring (2 N + 1),
+the arms (3 and 3), the corner (1).  Each block is symmetric in the inner product of its limit mask (weights N^2, 4, 1
+around the vertex, 1, 4, 1 on an arm), so `eigh` gives all eigenvalues, real, with orthogonal vectors, for multiple ones
+too.  What remains is to continue the vectors of one block into the next, by division by the difference of eigenvalues.
+These differ, but for 1/8, which the ring shares with the arms where N is a multiple of 4; there the numerator vanishes
+as well: A has no Jordan block for any N >= 3.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["Eigenstructure", "eigenstructure", "evaluate", "stencil", "subdivisi
 
 Floats = npt.NDArray[np.float64]
 
-EQUAL = 1e-9  # eigenvalues of different blocks that are nearer are equal; the others differ by 1e-3 or more up to N = 64
+EQUAL = 1e-9  # eigenvalues of two blocks that are nearer are equal; the others differ by 1e-3 or more up to N = 64
 ORDERS = (0, 1, 1, 2, 2, 2)  # of differentiation, of the rows of `evaluate`
 
 
@@ -110,7 +110,7 @@ class Eigenstructure:
     Eigenvalue 0 is 1: right[:, 0] is constant and left[0] the limit mask of the extraordinary vertex.
 
     Attributes:
-        eigenvalues: Those of the ring, falling, then of the arms and of the corner, shape (2 N + 8,).
+        eigenvalues: Those of the vertex and its ring, falling, then of the arms and of the corner, shape (2 N + 8,).
         right: Right eigenvectors in columns, shape (2 N + 8, 2 N + 8).
         left: Left eigenvectors in rows, shape (2 N + 8, 2 N + 8).
         patches: Bernstein coefficients of the eigenfunctions on children 1, 2 and 3 of the element, along the axes of

@@ -28,7 +28,7 @@ from thccs_fem.subdivision import Ints
 if TYPE_CHECKING:  # imported where it is needed: it takes its time
     import pyvista
 
-__all__ = ["bezier_grid", "cell_numbers", "in_space", "write_vtu"]
+__all__ = ["bezier_grid", "cell_numbers", "in_space", "one_for_each_cell", "write_vtu"]
 
 # Our coefficient i + 4 j at each place of VTK: corners, then sides (each towards larger i or j), then inside.
 VTK_ORDER = np.array([0, 3, 15, 12, 1, 2, 7, 11, 13, 14, 4, 8, 5, 6, 9, 10])
@@ -114,7 +114,9 @@ def bezier_grid(
     for name, numbers in cell_numbers(cells).items():
         grid.cell_data[name] = numbers
     for name, given in (cell_data or {}).items():
-        grid.cell_data[name] = _one_for_each_cell(cells, name, given)[cells.piece_cell]
+        if name in grid.cell_data:
+            raise ValueError(f"cell data called {name!r} are in the file already: choose another name")
+        grid.cell_data[name] = one_for_each_cell(cells, name, given)[cells.piece_cell]
     return grid
 
 
@@ -161,10 +163,12 @@ def _same_pieces(one: Hierarchy, other: Hierarchy) -> bool:
     return one.same_as(other) and np.array_equal(one.cap_levels, other.cap_levels)
 
 
-def _one_for_each_cell(cells: Cells, name: str, values: npt.ArrayLike) -> npt.NDArray[np.generic]:
-    """Return a user's cell data as an array, shape (num_cells,)."""
-    if name in cell_numbers(cells):
-        raise ValueError(f"cell data called {name!r} are in the file already: choose another name")
+def one_for_each_cell(cells: Cells, name: str, values: npt.ArrayLike) -> npt.NDArray[np.generic]:
+    """Return a user's cell data as an array, shape (num_cells,).
+
+    Raises:
+        ValueError: If they are not one number for each cell.
+    """
     array = np.asarray(values)
     if array.shape != (cells.num_cells,) or array.dtype.kind not in "biuf":
         raise ValueError(

@@ -1,7 +1,7 @@
 """Function spaces, functions, forms, assembly and boundary conditions.
 
-The solvers are optional parts and must be imported explicitly: `thccs_fem.fem.petsc` needs petsc4py and mpi4py,
-`thccs_fem.fem.scipy` nothing more than SciPy.
+Linear problems are solved by `thccs_fem.fem.scipy`, or by `thccs_fem.fem.petsc`, which must be imported explicitly: it
+needs petsc4py and mpi4py.
 """
 
 from thccs_fem.fem.assembly import assemble_cells, assemble_matrix, assemble_scalar, assemble_vector

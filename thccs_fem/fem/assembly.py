@@ -18,10 +18,11 @@ import scipy.sparse as sp
 
 from thccs_fem.extraction import Batch, Cells
 from thccs_fem.fem.forms import Form, Integral
+from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.jit import library
 
-__all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector"]
+__all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector", "bubble_energies"]
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -93,6 +94,34 @@ def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /)
         return _new_matrix(form)
     _refill(form, refilling)
     return form
+
+
+def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
+    """Return r^T K^-1 r for each cell, with K_ij = a(b_j, b_i) and r_i = L(b_i) - a(u, b_i) for its bubbles b.
+
+    Bubbles are the products of the cubic Bernstein polynomials 1 and 2 along the sides of the cell, in each component.
+
+    Args:
+        a: Bilinear form.
+        L: Linear form.
+        u: Function in the space of all arguments, on whose cells both forms are integrated.
+
+    Returns:
+        Shape (num_cells,): infinite where K is singular and the equations for K^-1 r have no solution.
+    """
+    cells, block_size = a.cells, u.function_space.block_size
+    size = 4 * block_size
+    K, r = np.zeros((cells.num_cells, size, size)), np.zeros((cells.num_cells, size))
+    places = cells.piece_origin, cells.piece_axes
+    for form in (a, L):
+        for loop in _loops(form):
+            batch = cells.batches[loop.number]
+            of_pieces = [_pointer(array[loop.first_piece :]) for array in places]
+            local = _pointer(batch.local(u.x.array.reshape(-1, block_size))) if form is a else library().ffi.NULL
+            loop.run(library().lib.thccs_assemble_on_bubbles, block_size, *of_pieces, local, _pointer(K), _pointer(r))
+    energies = np.zeros(cells.num_cells)
+    library().lib.thccs_solve_local(energies.size, size, *(_pointer(array) for array in (K, r, r.copy(), energies)))
+    return energies
 
 
 def _check_rank(form: Form, rank: int) -> None:
@@ -173,13 +202,17 @@ class _Loop:
     Attributes:
         batch: Pointer to a `thccs_batch`.
         integral: Pointer to a `thccs_integral`.
+        number: Number of the batch.
         first_cell: Number of cells in the batches before.
+        first_piece: Number of pieces in them.
         memory: What these structs point to.
     """
 
     batch: Any
     integral: Any
+    number: int
     first_cell: int
+    first_piece: int
     memory: list[Any]
 
     def run(self, function: Callable[..., int], *arguments: Any) -> None:
@@ -193,8 +226,8 @@ def _loops(form: Form) -> Iterator[_Loop]:
     coefficients = [_values(form, i) for i in range(len(form.coefficients))]
     block_sizes = np.array([f.function_space.block_size for f in form.coefficients], dtype=np.int32)
     constants = np.concatenate([np.ravel(c.value) for c in form.constants] or [np.zeros(0)]).astype(np.float64)
-    first_cell = 0
-    for batch in form.cells.batches:
+    first_cell = first_piece = 0
+    for number, batch in enumerate(form.cells.batches):
         memory: list[Any] = []
         c_batch = _c_batch(batch, form.cells, memory)
         for integral in form.integrals:
@@ -203,8 +236,9 @@ def _loops(form: Form) -> Iterator[_Loop]:
                 c_integral = _c_integral(integral, coefficients, block_sizes, constants, memory)
                 c_integral.num_cells = batch.cells.size if chosen is None else chosen.size
                 c_integral.cells = library().ffi.NULL if chosen is None else _pointer(chosen, memory)
-                yield _Loop(c_batch, c_integral, first_cell, memory)
+                yield _Loop(c_batch, c_integral, number, first_cell, first_piece, memory)
         first_cell += batch.cells.size
+        first_piece += batch.num_pieces
 
 
 def _chosen(cells: Cells, batch: Batch, integral: Integral) -> Ints | None:

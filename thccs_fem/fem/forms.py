@@ -103,7 +103,7 @@ def form(
     The quadrature of an integral is Gauss' rule for the degree in its metadata, as in
     ``dx(metadata={"quadrature_degree": 5})``; else for `quadrature_degree`; else for the degree of the integrand on a
     parallelogram, where arguments and functions count 3 and the geometry 0, but at least 7 (4 x 4 points) and at most
-    11 (6 x 6).
+    11 (6 x 6). Where the space brings its own rule (`FunctionSpace.with_integration`), that one holds.
 
     Args:
         ufl_form: A sum of integrals over ``dx``, or ``dx(tag)`` with a face tag of the mesh, or ``dx((tag, tag))``. A
@@ -114,7 +114,7 @@ def form(
     Raises:
         TypeError: It is no UFL form, or a coefficient or constant has no values.
         ValueError: It is zero, has no or several meshes, an unknown tag, an element other than THCCS, spaces that are
-            not refinements of one another, or a cell size.
+            not refinements of one another, a cell size, or a quadrature degree of its own on cells with another one.
         NotImplementedError: It has integrals other than dx.
         OSError: There is no C compiler, or the cache can't be written.
     """
@@ -132,6 +132,10 @@ def form(
     all_spaces = [*spaces, *(function.function_space for function in ufl_form.coefficients())]
     all_spaces += [] if on is None else [on]
     finest = _finest(all_spaces) if all_spaces else functionspace(mesh, ("THCCS", element.DEGREE))
+    cells = finest.integration_cells
+    if cells.quadrature_degree is not None:
+        quadrature_degree = cells.quadrature_degree
+        _check_metadata(ufl_form, quadrature_degree)
     ufl_form = _with_quadrature(ufl_form, quadrature_degree)
     (compiled,), module = jit.compile_forms([ufl_form])
     given = ufl_form.coefficients()
@@ -143,7 +147,7 @@ def form(
         constants=tuple(ufl_form.constants()),
         integrals=_integrals(compiled, module),
         hierarchy=finest.hierarchy,
-        cells=finest.cells,
+        cells=cells,
         transfers=_transfers(finest, all_spaces),
         module=module,
     )
@@ -221,12 +225,13 @@ def _check_values(ufl_form: ufl.Form) -> None:
 def _finest(spaces: Sequence[FunctionSpace]) -> FunctionSpace:
     """Return a space of which all the others are coarsenings."""
     for finest in spaces:
-        if all(finest.hierarchy is other.hierarchy or finest.is_refinement_of(other) for other in spaces):
+        if all(finest.is_refinement_of(other) for other in spaces):
             return finest
     listed = "\n".join(f"  {space!r}" for space in dict.fromkeys(spaces))
     raise ValueError(
         f"the form has functions in spaces of which none is a refinement of all the others:\n{listed}\n"
-        f"Carry them to a common refinement (adapt.refine, adapt.transfer), or use fem.project."
+        f"Carry them to a common refinement (adapt.refine, adapt.transfer), or use fem.project. Spaces that differ by "
+        f"with_integration share their coefficients: copy x.array."
     )
 
 
@@ -238,6 +243,17 @@ def _transfers(finest: FunctionSpace, spaces: Sequence[FunctionSpace]) -> dict[H
         for coarse in hierarchies
         if not (coarse is finest.hierarchy or coarse.same_as(finest.hierarchy))
     }
+
+
+def _check_metadata(ufl_form: ufl.Form, degree: int) -> None:
+    """Refuse rules other than that of the given degree."""
+    for integral in ufl_form.integrals():
+        metadata = integral.metadata()
+        if metadata.get("quadrature_degree", degree) != degree or "quadrature_rule" in metadata:
+            raise ValueError(
+                f"the metadata {metadata} ask for a rule of their own, but the cells of the space are made for degree "
+                f"{degree} alone: leave them out, or integrate on a space without with_integration"
+            )
 
 
 def _with_quadrature(ufl_form: ufl.Form, degree: int | None) -> ufl.Form:

@@ -200,6 +200,10 @@ class Constants:
     number: Ints
     integrals: Floats
 
+    def __post_init__(self) -> None:
+        self.number.setflags(write=False)
+        self.integrals.setflags(write=False)
+
     @property
     def num_constants(self) -> int:
         """Number of linearly independent ones."""

@@ -37,12 +37,11 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
         ValueError: The value has another shape than the functions of V, or is not finite somewhere.
     """
     if callable(value) and not isinstance(value, ufl.core.expr.Expr):
-        load = _load_at_points(value, V)
+        load, scalar = _load_at_points(value, V), FunctionSpace(V.hierarchy)
     else:
-        load = _load(_as_ufl(value, V), V)
+        load, scalar = _load(_as_ufl(value, V), V), FunctionSpace(V.hierarchy, (), V.integration)
     if not np.isfinite(load).all():
         raise ValueError("the value is not finite everywhere on the surface: give one that is")
-    scalar = FunctionSpace(V.hierarchy)
     mass = assemble_matrix(
         form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
     )

@@ -1,8 +1,8 @@
 """Linear problems solved by SciPy, on one rank: nothing needs to be installed for it.
 
-Matrices with up to `LARGEST_DIRECT` entries, and all that are not symmetric, are factorised by SuperLU; for larger ones
-there are conjugate gradients with Jacobi's preconditioner, which do for second-order problems. `thccs_fem.fem.petsc` has
-more to choose from.
+Matrices with up to `LARGEST_DIRECT` entries, and all that are not symmetric, are factorised by SuperLU; for larger
+ones there are conjugate gradients with Jacobi's preconditioner, which do for second-order problems.
+`thccs_fem.fem.petsc` has more to choose from.
 """
 
 from __future__ import annotations

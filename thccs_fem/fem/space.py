@@ -6,6 +6,7 @@ component of the value.  Degree of freedom `block_size * i + c` is component c o
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -34,13 +35,20 @@ class FunctionSpace(ufl.FunctionSpace):
     Args:
         hierarchy: The hierarchy that holds the scalar functions.
         value_shape: () for scalars, (k,) for vectors.
+        integration: Makes of the hierarchy the cells that forms are integrated on.
     """
 
-    def __init__(self, hierarchy: Hierarchy, value_shape: tuple[int, ...] = ()):
+    def __init__(
+        self,
+        hierarchy: Hierarchy,
+        value_shape: tuple[int, ...] = (),
+        integration: Callable[[Hierarchy], Cells] = extract,
+    ):
         super().__init__(  # type: ignore[no-untyped-call]  # UFL is typed in part
             hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline()
         )
         self.hierarchy = hierarchy
+        self.integration = integration
         self.block_size = int(np.prod(value_shape, dtype=int))
 
     @property
@@ -71,7 +79,12 @@ class FunctionSpace(ufl.FunctionSpace):
     @cached_property
     def cells(self) -> Cells:
         """Active elements with the extraction operators of their pieces."""
-        return _cells(self.hierarchy)
+        return _cells(self.hierarchy, extract)
+
+    @cached_property
+    def integration_cells(self) -> Cells:
+        """What forms are integrated on: `cells`, unless `with_integration` put others in their place."""
+        return _cells(self.hierarchy, self.integration)
 
     @cached_property
     def reference_points(self) -> npt.NDArray[np.float64]:
@@ -101,11 +114,24 @@ class FunctionSpace(ufl.FunctionSpace):
 
     def with_hierarchy(self, hierarchy: Hierarchy) -> FunctionSpace:
         """Return the space of the same kind on another hierarchy of the same mesh."""
-        return FunctionSpace(hierarchy, self.value_shape)
+        return FunctionSpace(hierarchy, self.value_shape, self.integration)
+
+    def with_integration(self, rule: Callable[[Hierarchy], Cells]) -> FunctionSpace:
+        """Return the space of the same functions whose forms are integrated in another way.
+
+        Coefficients and cells are the same in both, and so are boundary conditions, values at points, and output. A
+        form has functions of one of them only; ``g = fem.Function(W); g.x.array = f.x.array`` carries f over.
+
+        Args:
+            rule: `extraction.extract`, the default, or one of `quadrature`.
+        """
+        return FunctionSpace(self.hierarchy, self.value_shape, rule)
 
     def is_refinement_of(self, other: FunctionSpace) -> bool:
-        """Return whether every scalar function of `other` lies in this space."""
-        return self.hierarchy.is_refinement_of(other.hierarchy)
+        """Return whether every scalar function of `other` lies in this space, integrated in the same way."""
+        return self.integration is other.integration and (
+            self.hierarchy is other.hierarchy or self.hierarchy.is_refinement_of(other.hierarchy)
+        )
 
     def prolongation(self, coarse: FunctionSpace) -> sp.csr_array:
         """Return the exact transfer from a coarser space, shape (num_dofs, coarse.num_dofs).
@@ -124,6 +150,7 @@ class FunctionSpace(ufl.FunctionSpace):
         return (
             isinstance(other, FunctionSpace)
             and self.value_shape == other.value_shape
+            and self.integration is other.integration
             and (self.hierarchy is other.hierarchy or self.hierarchy.same_as(other.hierarchy))
         )
 
@@ -204,9 +231,9 @@ def _limit_points(hierarchy: Hierarchy, l: int) -> npt.NDArray[np.float64]:
     return points
 
 
-def _cells(hierarchy: Hierarchy) -> Cells:
-    """Return the cells of a hierarchy, made once and kept with it."""
-    cells = hierarchy.__dict__.get("_cells")
-    if cells is None:
-        cells = hierarchy.__dict__["_cells"] = extract(hierarchy)
-    return cells
+def _cells(hierarchy: Hierarchy, rule: Callable[[Hierarchy], Cells]) -> Cells:
+    """Return the cells that the rule makes of a hierarchy, made once and kept with it."""
+    kept: dict[Callable[[Hierarchy], Cells], Cells] = hierarchy.__dict__.setdefault("_cells", {})
+    if rule not in kept:
+        kept[rule] = rule(hierarchy)
+    return kept[rule]
