@@ -129,6 +129,8 @@ def test_pieces_are_points_of_the_limit_surface(name: str) -> None:
     expected = np.stack([x[0], *np.einsum("pij,ipc->jpc", cells.piece_axes, x[1:])])
     size = np.ptp(hierarchy.mesh.vertices, axis=0).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING * size)
+    assert cells.boundary_pieces[0].size == 0  # they are no pieces of the surface
+    assert (cells.locate(face, centre, named)[0] == -1).all()
 
 
 @pytest.mark.parametrize("rule", ["crease", "clamped"])

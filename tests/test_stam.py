@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from exact import ExactMesh
-from zoo import ZOO, grid, half_disc, wheel
+from zoo import ZOO, grid, half_disc, l_domain, wheel
 
 from thccs_fem import element, limit, stam
 from thccs_fem.bezier import spline_grid
@@ -321,19 +321,25 @@ def _unfit() -> dict[str, Callable[[], tuple[Level, Ints]]]:
     pair = control_level(ZOO["tripod"]())
     both = np.flatnonzero((~pair.regular[pair.quads]).sum(axis=1) > 1)
     rim = control_level(half_disc(3))
+    corner = control_level(l_domain(tagged=False, n=3))
+    inside = corner.regular[corner.quads] & ~corner.boundary[corner.quads]
+    at_corner = np.flatnonzero(inside.sum(axis=1) == 3)  # the middle one of the three faces at the reentrant vertex
+    k = np.flatnonzero(~inside[at_corner[0]])
     near_rim = control_level(wheel(5, 1))
     whole = control_level(wheel(5, 3))
     part = subdivide(whole, np.arange(whole.num_faces) == 0).fine
     return {
         "two irregular corners": lambda: (pair, (4 * both[:1]).astype(np.int32)),
         "on the boundary": lambda: (rim, at_vertex(rim)[:1]),
+        "at a reentrant vertex": lambda: (corner, (4 * at_corner[:1] + k).astype(np.int32)),
         "corners on the boundary": lambda: (near_rim, at_vertex(near_rim)[:1]),
         "faces not held": lambda: (part, np.zeros(1, dtype=np.int32)),
     }
 
 
 @pytest.mark.parametrize(
-    "case", ["two irregular corners", "on the boundary", "corners on the boundary", "faces not held"]
+    "case",
+    ["two irregular corners", "on the boundary", "at a reentrant vertex", "corners on the boundary", "faces not held"],
 )
 def test_elements_of_another_kind_are_refused(case: str) -> None:
     level, half_edges = _unfit()[case]()

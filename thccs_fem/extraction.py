@@ -241,7 +241,7 @@ class _Pieces:
     face: Ints
     nodes: Ints  # rows of points and of coefficients, 16 a piece
     points: Floats  # the control vertices of the level, then the points of pieces that are not regular
-    coefficients: sp.csr_array  # the same in terms of the dofs
+    coefficients: tuple[sp.csr_array, sp.csr_array]  # both in terms of the dofs
     origin: Floats
     axes: Floats
 
@@ -254,7 +254,8 @@ def extract(hierarchy: Hierarchy) -> Cells:
     first_node = np.cumsum([0, *(len(p.points) for p in pieces[:-1])])
     nodes = np.concatenate([first + p.nodes for first, p in zip(first_node, pieces, strict=True)]).astype(np.int32)
     cell = np.concatenate([p.cell for p in pieces])
-    batches, order = _batches(cell, nodes, sp.csr_array(sp.vstack([p.coefficients for p in pieces], format="csr")))
+    coefficients = sp.csr_array(sp.vstack([part for p in pieces for part in p.coefficients], format="csr"))
+    batches, order = _batches(cell, nodes, coefficients)
     place = np.zeros(order.size, dtype=np.int32)
     place[order] = np.arange(order.size, dtype=np.int32)
     return Cells(
@@ -350,7 +351,7 @@ def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Float
         face=faces,
         nodes=nodes,
         points=np.concatenate([points, to_spline @ (masks[:, : level.num_vertices] @ points)]),
-        coefficients=sp.csr_array(sp.vstack([coefficients[: level.num_vertices], masked], format="csr")),
+        coefficients=(sp.csr_array(coefficients[: level.num_vertices]), masked),
         origin=origin,
         axes=axes,
     )
@@ -358,7 +359,6 @@ def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Float
 
 def _batches(cell: Ints, nodes: Ints, coefficients: sp.csr_array) -> tuple[tuple[Batch, ...], Ints]:
     """Sort pieces into batches; return them and the order in which the pieces stand in them."""
-    coefficients.sort_indices()
     identity, dof = _identity(nodes, coefficients)
     same = np.flatnonzero(identity)
     same = same[np.argsort(cell[same], kind="stable")]
@@ -399,7 +399,8 @@ def _general_batches(
     starts = np.zeros(cells.size, dtype=np.int64)
     starts[order] = np.cumsum(blocks) - blocks
     values = np.zeros(blocks.sum())
-    rows.run("thccs_dense_rows", coefficients.data, offsets, dofs, width, starts, values)
+    place = np.zeros(coefficients.shape[1], dtype=np.int32)
+    rows.run("thccs_dense_rows", coefficients.data, offsets, dofs, width, starts, place, values)
     batches, batch_pieces = [], []
     for w in np.unique(width):
         chosen = order[width[order] == w]
@@ -421,7 +422,7 @@ class _Rows:
     Attributes:
         offsets: Rows of the k-th cell are rows[offsets[k]] .. rows[offsets[k + 1]], shape (cells + 1,).
         rows: Rows of the matrix.
-        matrix: Column indices of a row ascend.
+        matrix: The matrix.
     """
 
     offsets: Ints

@@ -44,7 +44,7 @@ Ints = npt.NDArray[np.int32]
 
 # Taubin's smoothing: a step towards the mean of the neighbours and a longer one back, so that detail
 # goes and volume stays.
-SMOOTHING_STEPS = (0.5, -0.53)
+SMOOTHING_STEPS = (0.5, -0.505)
 
 SAME_POINT = 1e-9  # of the span of all coordinates: points of blocks that are nearer are one vertex
 

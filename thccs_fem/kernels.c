@@ -591,16 +591,15 @@ void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32
 
 void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
                       const int32_t *indices, const double *data, const int32_t *offsets, const int32_t *columns,
-                      const int32_t *width, const int64_t *starts, double *values)
+                      const int32_t *width, const int64_t *starts, int32_t *place, double *values)
 {
-  for (int32_t c = 0; c < num_cells; ++c)
+  for (int32_t c = 0; c < num_cells; ++c) {
+    for (int32_t i = offsets[c]; i < offsets[c + 1]; ++i)
+      place[columns[i]] = i - offsets[c];
     for (int32_t r = cell_rows[c]; r < cell_rows[c + 1]; ++r) {
       double *row = values + starts[c] + (int64_t)(r - cell_rows[c]) * width[c];
-      const int32_t *column = columns + offsets[c];
-      for (int32_t k = indptr[rows[r]]; k < indptr[rows[r] + 1]; ++k) {
-        while (*column != indices[k])
-          ++column;
-        row[column - (columns + offsets[c])] = data[k];
-      }
+      for (int32_t k = indptr[rows[r]]; k < indptr[rows[r] + 1]; ++k)
+        row[place[indices[k]]] = data[k];
     }
+  }
 }

@@ -200,10 +200,9 @@ def subdivision_matrices(valence: int) -> tuple[Floats, Floats]:
     if valence < 3:
         raise ValueError(f"the valence is {valence}; an irregular element has 3 or more faces at its vertex")
     level = control_level(generators.wheel(valence, 2))
-    start = np.flatnonzero(level.vertices == 0)[:1].astype(np.int32)
     step = subdivide(level, np.ones(level.num_faces, dtype=bool))
-    columns = stencil(level, start)[0]
-    child = step.first_child[level.face[start]] + (start + np.arange(4)) % 4
+    columns = stencil(level, np.zeros(1, dtype=np.int32))[0]  # face 0 of a wheel begins at its hub
+    child = step.first_child[0] + np.arange(4, dtype=np.int32)
     rows = stencil(step.fine, 4 * child[:1])[0]
     # A child's axes are those of the element in quarter turns.
     grids = [np.rot90(spline_grid(step.fine, child[k : k + 1]).reshape(4, 4), -k).ravel() for k in (1, 2, 3)]

@@ -1,0 +1,488 @@
+"""The bubble estimator against dense quadrature, closed forms, and the energy norm of errors that are known."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from problems import lifted, poisson, projected_in_h1, randomly_refined, singular, smooth, uniformly_refined, wavy
+
+import ufl
+from thccs_fem import adapt, element, estimate, fem, generators, quadrature
+from thccs_fem.fem.assembly import assemble_cells
+from thccs_fem.mesh import ControlMesh
+from ufl import div, dx, grad, inner
+
+Floats = npt.NDArray[np.float64]
+Expr = ufl.core.expr.Expr
+Make = Callable[[], fem.FunctionSpace]
+
+
+def tagged(msh: ControlMesh) -> ControlMesh:
+    return ControlMesh(msh.vertices, msh.quads, face_tags=np.arange(msh.num_faces) % 3, corners=msh.corners)
+
+
+def planar(value_shape: tuple[int, ...] = (), times: int = 2) -> fem.FunctionSpace:
+    return randomly_refined(fem.functionspace(tagged(generators.wheel(5, 2)), ("THCCS", 3, value_shape)), times)
+
+
+def on_surface(value_shape: tuple[int, ...] = (), times: int = 2) -> fem.FunctionSpace:
+    return randomly_refined(fem.functionspace(tagged(generators.cube_sphere(2)), ("THCCS", 3, value_shape)), times)
+
+
+def curved(value_shape: tuple[int, ...] = (), times: int = 2) -> fem.FunctionSpace:
+    return randomly_refined(fem.functionspace(tagged(lifted(generators.wheel(8, 2))), ("THCCS", 3, value_shape)), times)
+
+
+SPACES = {"planar": planar, "closed": on_surface, "with a rim in space": curved}
+each_space = pytest.mark.parametrize("make", SPACES.values(), ids=SPACES)
+
+
+def arguments(V: fem.FunctionSpace) -> tuple[ufl.Argument, ufl.Argument]:
+    return ufl.TrialFunction(V), ufl.TestFunction(V)
+
+
+def with_random_values(V: fem.FunctionSpace, seed: int = 0) -> fem.Function:
+    function = fem.Function(V)
+    function.x.array = np.random.default_rng(seed).standard_normal(V.num_dofs)
+    return function
+
+
+def energy(u: Expr, v: Expr) -> ufl.Form:
+    return (inner(grad(u), grad(v)) + u * v) * dx
+
+
+# ---- The slow path: every term by dense quadrature, cell by cell
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The integrals of grad(v) : A grad(u), v . (grad(u) beta), w v . M u, those of tag 1 again, and v . (x0, x1 ..).
+
+    A and M, of shape (k, k), couple components; neither is symmetric.
+    """
+
+    A: Floats
+    M: Floats
+    beta: Floats
+    w: fem.Function
+
+    @classmethod
+    def on(cls, V: fem.FunctionSpace, w: fem.Function) -> "Problem":
+        rng, k = np.random.default_rng(1), V.block_size
+        A, M = (2 * np.eye(k) + 0.3 * rng.standard_normal((k, k)) for _ in range(2))
+        return cls(A, M, rng.standard_normal(V.mesh.gdim), w)
+
+    def forms(self, V: fem.FunctionSpace) -> tuple[ufl.Form, ufl.Form]:
+        u, v = arguments(V)
+        x, msh = ufl.SpatialCoordinate(V.mesh), V.mesh
+        A, M, beta = (fem.Constant(msh, value if V.value_shape else np.squeeze(value)) for value in self._parts(V))
+        product = ufl.dot if V.value_shape else (lambda matrix, right: matrix * right)
+        a = inner(product(A, grad(u)), grad(v)) * dx + inner(ufl.dot(grad(u), beta), v) * dx
+        a += self.w * inner(product(M, u), v) * dx + inner(grad(u), grad(v)) * dx(1)
+        load = ufl.as_vector([x[i] for i in range(V.block_size)]) if V.value_shape else x[0]
+        L = inner(load, v) * dx + inner(load, v) * dx((0, 1))
+        return tuple(self._with_degree_7(integrals) for integrals in (a, L))
+
+    def _parts(self, V: fem.FunctionSpace) -> tuple[Floats, Floats, Floats]:
+        return self.A, self.M, self.beta
+
+    @staticmethod
+    def _with_degree_7(given: ufl.Form) -> ufl.Form:
+        return ufl.Form([part.reconstruct(metadata={"quadrature_degree": 7}) for part in given.integrals()])
+
+    def indicators(self, uh: fem.Function) -> Floats:
+        V = uh.function_space
+        cells, k = V.cells, V.block_size
+        K, r = np.zeros((V.num_cells, 4 * k, 4 * k)), np.zeros((V.num_cells, 4 * k))
+        w = adapt.transfer(self.w, fem.FunctionSpace(V.hierarchy)).local_coefficients()
+        u = uh.local_coefficients()
+        for piece, cell in enumerate(cells.piece_cell):
+            self._add_piece(V, piece, u, w, int(cells.tag[cell]), K[cell], r[cell])
+        return np.array([np.sqrt(abs(r_ @ np.linalg.solve(K_, r_))) for K_, r_ in zip(K, r, strict=True)])
+
+    def _add_piece(
+        self, V: fem.FunctionSpace, piece: int, u: Floats, w: Floats, tag: int, K: Floats, r: Floats
+    ) -> None:
+        cells, k = V.cells, V.block_size
+        uv, weights = gauss(4)
+        N, slopes = local_basis(uv)
+        J = np.einsum("qdi,ic->qcd", slopes, cells.piece_points[piece])
+        metric = np.einsum("qcd,qce->qde", J, J)
+        dS = weights * np.sqrt(np.linalg.det(metric))
+        to_surface = np.einsum("qcd,qde->qce", J, np.linalg.inv(metric))
+        axes = cells.piece_axes[piece]
+        b, of_cell = cell_bubbles(cells.piece_origin[piece] + uv @ axes.T)
+        grad_b = np.einsum("qce,fe,qif->qic", to_surface, axes, of_cell)  # column e of axes is the derivative along e
+        value, slope = N @ u[piece], np.einsum("qce,qei,ir->qrc", to_surface, slopes, u[piece])
+        x, mass = N @ cells.piece_points[piece], dS * (N @ w[piece])[:, 0]
+        # Components (i, r) of the residual, and ((i, r), (j, s)) of the matrix.
+        A = self.A + (tag == 1) * np.eye(k)
+        loads = 1 + (tag in (0, 1))
+        flux, advected = np.einsum("rs,qsc->qrc", A, slope), slope @ self.beta
+        of_values = dS[:, None] * (loads * x[:, :k] - advected) - mass[:, None] * (value @ self.M.T)
+        r += (np.einsum("qi,qr->ir", b, of_values) - np.einsum("q,qic,qrc->ir", dS, grad_b, flux)).ravel()
+        stiffness = np.einsum("q,qic,qjc->ij", dS, grad_b, grad_b)
+        advection = np.einsum("q,qi,qjc,c->ij", dS, b, grad_b, self.beta)
+        K += (
+            np.kron(stiffness, A)
+            + np.kron(advection, np.eye(k))
+            + np.kron(np.einsum("q,qi,qj->ij", mass, b, b), self.M)
+        )
+
+
+def gauss(n: int) -> tuple[Floats, Floats]:
+    """Return Gauss points of the reference square, shape (n * n, 2), and their weights."""
+    t, w = np.polynomial.legendre.leggauss(n)
+    x, y = np.meshgrid((t + 1) / 2, (t + 1) / 2)
+    return np.column_stack([x.ravel(), y.ravel()]), np.outer(w, w).ravel() / 4
+
+
+def local_basis(uv: Floats) -> tuple[Floats, Floats]:
+    """Return values of the 16 local functions, shape (n, 16), and derivatives along u and v, shape (n, 2, 16)."""
+    values, slopes = (function(uv) for function in (element.bspline_values, element.bspline_slopes))
+
+    def products(along_u: Floats, along_v: Floats) -> Floats:
+        return (along_v[:, :, None] * along_u[:, None, :]).reshape(-1, 16)
+
+    derivatives = products(slopes[:, 0], values[:, 1]), products(values[:, 0], slopes[:, 1])
+    return products(values[:, 0], values[:, 1]), np.stack(derivatives, axis=1)
+
+
+def cell_bubbles(x: Floats) -> tuple[Floats, Floats]:
+    """Return values of the bubbles at points of the cell's square, shape (n, 4), and gradients, shape (n, 4, 2)."""
+    f = np.stack([x * (1 - x) ** 2, x**2 * (1 - x)], axis=-1)
+    df = np.stack([(1 - x) * (1 - 3 * x), x * (2 - 3 * x)], axis=-1)
+
+    def products(along_x: Floats, along_y: Floats) -> Floats:
+        return np.einsum("ni,nj->nij", along_x, along_y).reshape(-1, 4)
+
+    gradients = products(df[:, 0], f[:, 1]), products(f[:, 0], df[:, 1])
+    return products(f[:, 0], f[:, 1]), np.stack(gradients, axis=-1)
+
+
+@each_space
+@pytest.mark.parametrize("value_shape", [(), (2,), (3,)], ids=["scalar", "2 components", "3 components"])
+def test_dense_quadrature_gives_the_same(make: Callable[..., fem.FunctionSpace], value_shape: tuple[int, ...]) -> None:
+    """A form that is not symmetric, with tags and a function of a coarser space; the forms are compiled or not."""
+    V = make(value_shape)
+    if V.block_size > V.mesh.gdim:
+        pytest.skip("the load has a component for each coordinate")
+    w = with_random_values(fem.functionspace(V.mesh, ("THCCS", 3)), 1)
+    w.x.array = 1.0 + w.x.array**2
+    problem, uh = Problem.on(V, w), with_random_values(V)
+    a, L = problem.forms(V)
+    expected = problem.indicators(uh)
+    np.testing.assert_allclose(estimate.bubble(uh, a, L), expected, rtol=1e-9)  # condition numbers below 1e5
+    np.testing.assert_allclose(estimate.bubble(uh, fem.form(a), fem.form(L)), expected, rtol=1e-9)
+
+
+# ---- What it must be
+
+
+def test_bubble_that_is_the_error_is_found_whole() -> None:
+    """For a bubble U on a square, the integral of |grad(U)|^2 is 2 B(5, 3) (4/3 - 3 + 9/5)."""
+    V = fem.functionspace(generators.rectangle((1, 1)), ("THCCS", 3))
+    x, y = ufl.SpatialCoordinate(V.mesh)
+    u, v = arguments(V)
+    L = inner(grad(x**2 * (1 - x) * y * (1 - y) ** 2), grad(v)) * dx
+    eta = estimate.bubble(fem.Function(V), inner(grad(u), grad(v)) * dx, L)
+    np.testing.assert_allclose(eta**2, 4 / 1575, rtol=1e-12)
+
+
+@each_space
+def test_zero_for_a_solution_in_the_space(make: Make) -> None:
+    V = make()
+    u, v = arguments(V)
+    uh = with_random_values(V)
+    eta = estimate.bubble(uh, energy(u, v), energy(uh, v))
+    assert estimate.norm(V, eta) < 1e-12 * estimate.norm(V, estimate.error(uh, ufl.as_ufl(0.0), "H1"))
+
+
+def test_zero_for_a_linear_function_in_the_plane() -> None:
+    """Not by the same sums on both sides, as above: grad(u) . grad(v) integrates to zero."""
+    V = planar()
+    u, v = arguments(V)
+    x = ufl.SpatialCoordinate(V.mesh)
+    uh = projected_in_h1(V, 1 + 2 * x[0] - 3 * x[1])
+    eta = estimate.bubble(uh, inner(grad(u), grad(v)) * dx, fem.Constant(V.mesh, 0.0) * v * dx)
+    assert estimate.norm(V, eta) < 1e-12
+
+
+@each_space
+def test_zero_for_a_solution_in_a_coarser_space(make: Callable[..., fem.FunctionSpace]) -> None:
+    coarse = make(times=1)
+    exact = with_random_values(coarse)
+    V = randomly_refined(coarse)
+    u, v = arguments(V)
+    eta = estimate.bubble(adapt.transfer(exact, V), energy(u, v), energy(exact, v))
+    assert estimate.norm(V, eta) < 1e-12 * estimate.norm(V, estimate.error(adapt.transfer(exact, V), ufl.as_ufl(0.0)))
+
+
+@each_space
+def test_scales_as_energy_norms_do(make: Make) -> None:
+    V = make()
+    u, v = arguments(V)
+    uh, double = with_random_values(V), with_random_values(V)
+    double.x.array *= 2.0
+    load = ufl.sin(ufl.SpatialCoordinate(V.mesh)[0]) * v * dx
+    eta = estimate.bubble(uh, energy(u, v), load)
+    np.testing.assert_allclose(estimate.bubble(double, energy(u, v), 2 * load), 2 * eta, rtol=1e-12)
+    np.testing.assert_allclose(estimate.bubble(uh, 9 * energy(u, v), 9 * load), 3 * eta, rtol=1e-12)
+
+
+@each_space
+def test_at_most_the_energy_norm_of_the_error_in_every_cell(make: Make) -> None:
+    """It is the norm of a projection; with the same quadrature everywhere that holds to rounding."""
+    V = make()
+    u, v = arguments(V)
+    exact = smooth(ufl.SpatialCoordinate(V.mesh)) if V.mesh.gdim == 3 else wavy(ufl.SpatialCoordinate(V.mesh))
+    uh = projected_in_h1(V, exact)
+    a, L = fem.form(energy(u, v), quadrature_degree=9), fem.form(energy(exact, v), quadrature_degree=9)
+    true = energy_error(uh, exact, 1.0, quadrature_degree=9)
+    eta = estimate.bubble(uh, a, L)
+    assert (eta <= true * (1 + 1e-9)).all()
+    assert estimate.norm(V, eta) > 0.3 * estimate.norm(V, true)
+
+
+def test_components_that_are_not_coupled_add_up() -> None:
+    V = on_surface((2,), times=1)
+    scalar = fem.FunctionSpace(V.hierarchy)
+    parts = [with_random_values(scalar, seed) for seed in (1, 2)]
+    both = fem.Function(V)
+    both.x.array = np.column_stack([part.x.array for part in parts]).ravel()
+    (u, v), (w, z), x = arguments(V), arguments(scalar), ufl.SpatialCoordinate(V.mesh)
+    a = (inner(grad(u), grad(v)) + inner(u, v)) * dx
+    eta = estimate.bubble(both, a, (x[0] * v[0] + x[2] * v[1]) * dx)
+    one, other = (estimate.bubble(p, energy(w, z), x[i] * z * dx) for p, i in zip(parts, (0, 2), strict=True))
+    np.testing.assert_allclose(eta, np.hypot(one, other), rtol=1e-12)
+
+
+def test_other_cells_to_integrate_on() -> None:
+    """The paper's rule is 4 x 4 Gauss on regular cells, which 4 x 4 pieces of one point each amount to."""
+    V = fem.functionspace(generators.torus((5, 4)), ("THCCS", 3))
+    found = []
+    for W in (V, V.with_integration(quadrature.paper_cells)):
+        u, v = arguments(W)
+        found.append(estimate.bubble(with_random_values(W), energy(u, v), ufl.SpatialCoordinate(W.mesh)[0] * v * dx))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
+
+
+# ---- Singular local problems, values that are not finite
+
+
+def test_zero_where_there_is_no_equation() -> None:
+    V = planar()
+    u, v = arguments(V)
+    uh = with_random_values(V)
+    eta = estimate.bubble(uh, inner(grad(u), grad(v)) * dx(1), v * dx(1))
+    np.testing.assert_array_equal(eta[V.cells.tag != 1], 0.0)
+    everywhere = estimate.bubble(uh, inner(grad(u), grad(v)) * dx, v * dx)
+    np.testing.assert_allclose(eta[V.cells.tag == 1], everywhere[V.cells.tag == 1], rtol=1e-12)
+
+
+def test_components_without_an_equation_do_not_matter() -> None:
+    V = planar((3,))
+    scalar = fem.FunctionSpace(V.hierarchy)
+    (u, v), (w, z) = arguments(V), arguments(scalar)
+    uh, part = with_random_values(V), fem.Function(scalar)
+    part.x.array = uh.x.array[1::3]
+    eta = estimate.bubble(uh, inner(grad(u[1]), grad(v[1])) * dx, v[1] * dx)
+    np.testing.assert_allclose(eta, estimate.bubble(part, inner(grad(w), grad(z)) * dx, z * dx), rtol=1e-11)
+
+
+def test_equations_that_say_the_same_twice() -> None:
+    """The matrix has half its rank, and rounding where it should have zeros."""
+    V = planar((2,))
+    scalar = fem.FunctionSpace(V.hierarchy)
+    (u, v), (w, z) = arguments(V), arguments(scalar)
+    uh, total = with_random_values(V), fem.Function(scalar)
+    total.x.array = uh.x.array[::2] + 3 * uh.x.array[1::2]
+    both = [g[0] + 3 * g[1] for g in (u, v)]
+    eta = estimate.bubble(uh, inner(*map(grad, both)) * dx, both[1] * dx)
+    np.testing.assert_allclose(eta, estimate.bubble(total, inner(grad(w), grad(z)) * dx, z * dx), rtol=1e-8)
+
+
+def test_components_of_any_size_are_no_singularity() -> None:
+    """Not even where one equation is 1e-20 times the other."""
+    V = planar((2,))
+    u, v = arguments(V)
+    uh = with_random_values(V)
+    small = fem.Constant(V.mesh, 1e-20)
+    first = estimate.bubble(uh, inner(grad(u[0]), grad(v[0])) * dx, v[0] * dx)
+    second = estimate.bubble(uh, inner(grad(u[1]), grad(v[1])) * dx, v[1] * dx)
+    a = (inner(grad(u[0]), grad(v[0])) + small * inner(grad(u[1]), grad(v[1]))) * dx
+    eta = estimate.bubble(uh, a, (v[0] + small * v[1]) * dx)
+    np.testing.assert_allclose(eta, np.hypot(first, 1e-10 * second), rtol=1e-10)
+    eta = estimate.bubble(uh, a, small * v[1] * dx + inner(grad(uh[0]), grad(v[0])) * dx)
+    np.testing.assert_allclose(eta, 1e-10 * second, rtol=1e-4)  # the rounding of the first component is left
+
+
+def test_load_without_an_equation_is_named() -> None:
+    V = planar()
+    u, v = arguments(V)
+    with pytest.raises(ValueError, match=r"of \d+ cells have no solution, the first that of cell \d+ on face"):
+        estimate.bubble(with_random_values(V), inner(grad(u), grad(v)) * dx(1), v * dx)
+    with pytest.raises(ValueError, match=f"local problems of {V.num_cells} cells have no solution"):
+        estimate.bubble(with_random_values(V), fem.Constant(V.mesh, 0.0) * u * v * dx, v * dx)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_seen_and_stay_where_they_are(value: float) -> None:
+    V = planar()
+    u, v = arguments(V)
+    uh = with_random_values(V)
+    usual = estimate.bubble(uh, energy(u, v), v * dx)
+    uh.x.array[-1] = np.nan
+    eta = estimate.bubble(uh, energy(u, v), v * dx)
+    near = [batch.cells[(batch.dofs == V.num_dofs - 1).any(axis=1)] for batch in V.cells.batches]
+    hit = np.isin(np.arange(V.num_cells), np.concatenate(near))
+    assert np.isnan(eta[hit]).all()
+    np.testing.assert_array_equal(eta[~hit], usual[~hit])
+    kappa = fem.Constant(V.mesh, value)
+    assert np.isnan(estimate.bubble(with_random_values(V), kappa * energy(u, v), v * dx)).all()
+
+
+# ---- What is refused
+
+
+def test_other_spaces_are_refused() -> None:
+    coarse = planar(times=0)
+    V = randomly_refined(coarse)
+    (u, v), (w, z) = arguments(coarse), arguments(V)
+    with pytest.raises(ValueError, match="but the arguments of a are in FunctionSpace"):
+        estimate.bubble(fem.Function(V), energy(u, v), v * dx)
+    with pytest.raises(ValueError, match="but the arguments of a are in FunctionSpace"):
+        estimate.bubble(fem.Function(V), energy(w, z), v * dx)
+    with pytest.raises(ValueError, match="but the arguments of a are in FunctionSpace"):
+        estimate.bubble(fem.Function(V), energy(w, v), z * dx)
+
+
+def test_an_equal_space_is_the_same() -> None:
+    msh = generators.wheel(5, 2)
+    V, W = (randomly_refined(fem.functionspace(msh, ("THCCS", 3))) for _ in range(2))
+    assert V == W
+    assert V.cells is not W.cells
+    u, v = arguments(W)
+    usual = estimate.bubble(with_random_values(W), energy(u, v), v * dx)
+    np.testing.assert_array_equal(estimate.bubble(with_random_values(V), energy(u, v), v * dx), usual)
+
+
+def test_forms_of_the_wrong_rank_are_refused() -> None:
+    V = planar(times=0)
+    u, v = arguments(V)
+    with pytest.raises(ValueError, match="a and L have 1 and 2 arguments"):
+        estimate.bubble(fem.Function(V), v * dx, energy(u, v))
+
+
+def test_functions_of_a_finer_space_are_refused() -> None:
+    V = planar(times=0)
+    u, v = arguments(V)
+    finer = with_random_values(randomly_refined(V))
+    with pytest.raises(ValueError, match="functions on a refinement of the cells that indicators are wanted for"):
+        estimate.bubble(fem.Function(V), energy(u, v), finer * v * dx)
+
+
+def test_fourth_order_equations_are_refused() -> None:
+    V = planar(times=0)
+    u, v = arguments(V)
+    with pytest.raises(ValueError, match="second derivatives of the test function"):
+        estimate.bubble(fem.Function(V), div(grad(u)) * div(grad(v)) * dx, v * dx)
+    assert (estimate.bubble(fem.Function(V), -div(grad(u)) * v * dx, v * dx) > 0.0).all()  # of the trial function: fine
+
+
+# ---- Effectivity: the estimate over the energy norm of the error
+
+
+def tangential(V: fem.FunctionSpace, gradient: Expr) -> Expr:
+    domain = V.mesh.ufl_domain()
+    return ufl.dot(gradient, ufl.Jacobian(domain) * ufl.JacobianInverse(domain))
+
+
+def energy_error(uh: fem.Function, exact: Expr, c: float, quadrature_degree: int = 11) -> Floats:
+    e = uh - exact
+    gradient = tangential(uh.function_space, grad(e))
+    density = (inner(gradient, gradient) + c * e * e) * dx
+    return np.sqrt(assemble_cells(fem.form(density, quadrature_degree=quadrature_degree)))
+
+
+@pytest.mark.parametrize("valence", [3, 4, 5, 8])
+def test_effectivity_on_all_levels_of_uniform_refinement(valence: int) -> None:
+    V = fem.functionspace(generators.wheel(valence, 2), ("THCCS", 3))
+    exact = wavy(ufl.SpatialCoordinate(V.mesh))
+    found = []
+    for _ in range(4):
+        V = uniformly_refined(V)
+        u, v = arguments(V)
+        uh = poisson(V, exact, 6.25 * exact)
+        eta = estimate.bubble(uh, inner(grad(u), grad(v)) * dx, 6.25 * exact * v * dx)
+        found.append(estimate.norm(V, eta) / estimate.norm(V, energy_error(uh, exact, 0.0)))
+    assert 0.35 < min(found)  # 0.71 on regular meshes, 0.38 near a vertex of valence 8, where all the error is at last
+    assert max(found) < 0.75
+
+
+def is_constant(effectivity: Floats) -> bool:
+    """Tell whether all are within 20 % of one value."""
+    return bool(effectivity.max() / effectivity.min() < 1.2 / 0.8)
+
+
+def bump_on_a_torus(x: Expr) -> Expr:
+    return ufl.exp(-2 * ((x[0] - 3) ** 2 + x[1] ** 2 + x[2] ** 2))
+
+
+def bump_on_a_sphere(x: Expr) -> Expr:
+    return ufl.exp(-10 * sum((x[i] - 3**-0.5) ** 2 for i in range(3)))  # at an extraordinary vertex
+
+
+CLOSED = {
+    "torus": (lambda: generators.torus((16, 8)), bump_on_a_torus),
+    "sphere": (lambda: generators.cube_sphere(4), bump_on_a_sphere),
+}
+
+
+@pytest.mark.parametrize(("make", "exact"), CLOSED.values(), ids=CLOSED)
+def test_effectivity_is_constant_in_adaptive_runs(
+    make: Callable[[], ControlMesh], exact: Callable[[Expr], Expr]
+) -> None:
+    V = fem.functionspace(make(), ("THCCS", 3))
+    solution = exact(ufl.SpatialCoordinate(V.mesh))
+    found = []
+
+    def indicators(uh: fem.Function) -> Floats:
+        V = uh.function_space
+        u, v = arguments(V)
+        eta = estimate.bubble(uh, energy(u, v), energy(solution, v))
+        found.append(estimate.norm(V, eta) / estimate.norm(V, energy_error(uh, solution, 1.0)))
+        return eta
+
+    adapt.solve(V, lambda V: projected_in_h1(V, solution), indicators, steps=30, max_dofs=1200, progress=False)
+    resolved = np.array(found[2:])  # before, a bump is as wide as a cell
+    assert resolved.size > 8
+    assert is_constant(resolved)
+    assert 0.35 < resolved.min() < resolved.max() < 0.65
+
+
+def test_l_domain() -> None:
+    V = fem.functionspace(generators.l_domain(4), ("THCCS", 3), cap_level=16)  # graded quadrature at the corner
+    exact = singular(ufl.SpatialCoordinate(V.mesh))
+    zero = fem.Constant(V.mesh, 0.0)
+    rows = []
+
+    def indicators(uh: fem.Function) -> Floats:
+        V = uh.function_space
+        u, v = arguments(V)
+        eta = estimate.bubble(uh, inner(grad(u), grad(v)) * dx, zero * v * dx)
+        true = estimate.norm(V, energy_error(uh, exact, 0.0))
+        rows.append((V.num_dofs, true, estimate.norm(V, eta) / true))
+        return eta
+
+    adapt.solve(V, lambda V: poisson(V, exact, zero), indicators, steps=40, max_dofs=1000, progress=False)
+    dofs, errors, effectivity = np.array(rows).T
+    needed = np.exp(np.interp(-np.log(3e-4), -np.log(errors), np.log(dofs)))
+    assert needed < 950  # 885 were measured, and 777 in a run that the error itself drives
+    late = dofs > 380
+    slope = np.polyfit(np.log(dofs[late]), np.log(errors[late]), 1)[0]
+    assert -2.5 < slope < -1.5  # -1.9 was measured; -1.5 is optimal, and what was lost before is caught up
+    assert is_constant(effectivity)
+    assert 0.35 < effectivity.min() < effectivity.max() < 0.5
