@@ -58,7 +58,7 @@ def energy(u: Expr, v: Expr) -> ufl.Form:
 
 @dataclass(frozen=True)
 class Problem:
-    """The integrals of grad(v) : A grad(u), v . (grad(u) beta), w v . M u, those of tag 1 again, and v . (x0, x1 ..).
+    """The integrals of grad(v) : A grad(u), v . (grad(u) beta), w v . M u, |grad(v)|^2 on tag 1, and v . (x0, x1 ..).
 
     A and M, of shape (k, k), couple components; neither is symmetric.
     """
@@ -77,20 +77,14 @@ class Problem:
     def forms(self, V: fem.FunctionSpace) -> tuple[ufl.Form, ufl.Form]:
         u, v = arguments(V)
         x, msh = ufl.SpatialCoordinate(V.mesh), V.mesh
-        A, M, beta = (fem.Constant(msh, value if V.value_shape else np.squeeze(value)) for value in self._parts(V))
+        A, M = (fem.Constant(msh, m if V.value_shape else m[0, 0]) for m in (self.A, self.M))
+        beta = fem.Constant(msh, self.beta)
         product = ufl.dot if V.value_shape else (lambda matrix, right: matrix * right)
         a = inner(product(A, grad(u)), grad(v)) * dx + inner(ufl.dot(grad(u), beta), v) * dx
         a += self.w * inner(product(M, u), v) * dx + inner(grad(u), grad(v)) * dx(1)
-        load = ufl.as_vector([x[i] for i in range(V.block_size)]) if V.value_shape else x[0]
+        load = ufl.as_vector([x[i % V.mesh.gdim] for i in range(V.block_size)]) if V.value_shape else x[0]
         L = inner(load, v) * dx + inner(load, v) * dx((0, 1))
-        return tuple(self._with_degree_7(integrals) for integrals in (a, L))
-
-    def _parts(self, V: fem.FunctionSpace) -> tuple[Floats, Floats, Floats]:
-        return self.A, self.M, self.beta
-
-    @staticmethod
-    def _with_degree_7(given: ufl.Form) -> ufl.Form:
-        return ufl.Form([part.reconstruct(metadata={"quadrature_degree": 7}) for part in given.integrals()])
+        return a, L
 
     def indicators(self, uh: fem.Function) -> Floats:
         V = uh.function_space
@@ -116,20 +110,18 @@ class Problem:
         b, of_cell = cell_bubbles(cells.piece_origin[piece] + uv @ axes.T)
         grad_b = np.einsum("qce,fe,qif->qic", to_surface, axes, of_cell)  # column e of axes is the derivative along e
         value, slope = N @ u[piece], np.einsum("qce,qei,ir->qrc", to_surface, slopes, u[piece])
-        x, mass = N @ cells.piece_points[piece], dS * (N @ w[piece])[:, 0]
+        x = (N @ cells.piece_points[piece])[:, np.arange(k) % V.mesh.gdim]
+        mass = dS * (N @ w[piece])[:, 0]
         # Components (i, r) of the residual, and ((i, r), (j, s)) of the matrix.
         A = self.A + (tag == 1) * np.eye(k)
         loads = 1 + (tag in (0, 1))
         flux, advected = np.einsum("rs,qsc->qrc", A, slope), slope @ self.beta
-        of_values = dS[:, None] * (loads * x[:, :k] - advected) - mass[:, None] * (value @ self.M.T)
+        of_values = dS[:, None] * (loads * x - advected) - mass[:, None] * (value @ self.M.T)
         r += (np.einsum("qi,qr->ir", b, of_values) - np.einsum("q,qic,qrc->ir", dS, grad_b, flux)).ravel()
         stiffness = np.einsum("q,qic,qjc->ij", dS, grad_b, grad_b)
         advection = np.einsum("q,qi,qjc,c->ij", dS, b, grad_b, self.beta)
-        K += (
-            np.kron(stiffness, A)
-            + np.kron(advection, np.eye(k))
-            + np.kron(np.einsum("q,qi,qj->ij", mass, b, b), self.M)
-        )
+        reaction = np.einsum("q,qi,qj->ij", mass, b, b)
+        K += np.kron(stiffness, A) + np.kron(advection, np.eye(k)) + np.kron(reaction, self.M)
 
 
 def gauss(n: int) -> tuple[Floats, Floats]:
@@ -165,17 +157,13 @@ def cell_bubbles(x: Floats) -> tuple[Floats, Floats]:
 @each_space
 @pytest.mark.parametrize("value_shape", [(), (2,), (3,)], ids=["scalar", "2 components", "3 components"])
 def test_dense_quadrature_gives_the_same(make: Callable[..., fem.FunctionSpace], value_shape: tuple[int, ...]) -> None:
-    """A form that is not symmetric, with tags and a function of a coarser space; the forms are compiled or not."""
+    """A form that is not symmetric, with tags and a function of a coarser space."""
     V = make(value_shape)
-    if V.block_size > V.mesh.gdim:
-        pytest.skip("the load has a component for each coordinate")
     w = with_random_values(fem.functionspace(V.mesh, ("THCCS", 3)), 1)
     w.x.array = 1.0 + w.x.array**2
     problem, uh = Problem.on(V, w), with_random_values(V)
-    a, L = problem.forms(V)
-    expected = problem.indicators(uh)
-    np.testing.assert_allclose(estimate.bubble(uh, a, L), expected, rtol=1e-9)  # condition numbers below 1e5
-    np.testing.assert_allclose(estimate.bubble(uh, fem.form(a), fem.form(L)), expected, rtol=1e-9)
+    a, L = (fem.form(given, quadrature_degree=7) for given in problem.forms(V))  # 4 x 4 points, as there
+    np.testing.assert_allclose(estimate.bubble(uh, a, L), problem.indicators(uh), rtol=1e-9)  # condition < 1e5
 
 
 # ---- What it must be
@@ -298,8 +286,8 @@ def test_equations_that_say_the_same_twice() -> None:
     scalar = fem.FunctionSpace(V.hierarchy)
     (u, v), (w, z) = arguments(V), arguments(scalar)
     uh, total = with_random_values(V), fem.Function(scalar)
-    total.x.array = uh.x.array[::2] + 3 * uh.x.array[1::2]
-    both = [g[0] + 3 * g[1] for g in (u, v)]
+    total.x.array = 0.3 * uh.x.array[::2] + 0.7 * uh.x.array[1::2]
+    both = [0.3 * g[0] + 0.7 * g[1] for g in (u, v)]
     eta = estimate.bubble(uh, inner(*map(grad, both)) * dx, both[1] * dx)
     np.testing.assert_allclose(eta, estimate.bubble(total, inner(grad(w), grad(z)) * dx, z * dx), rtol=1e-8)
 
@@ -319,6 +307,15 @@ def test_components_of_any_size_are_no_singularity() -> None:
     np.testing.assert_allclose(eta, 1e-10 * second, rtol=1e-4)  # the rounding of the first component is left
 
 
+def test_equations_that_say_nearly_the_same_twice() -> None:
+    V = planar((2,))
+    w = fem.Function(fem.FunctionSpace(V.hierarchy))
+    problem = Problem(np.array([[1.0, 1.0], [1.0, 1.0 + 1e-8]]), np.zeros((2, 2)), np.zeros(2), w)
+    uh = with_random_values(V)
+    a, L = (fem.form(given, quadrature_degree=7) for given in problem.forms(V))
+    np.testing.assert_allclose(estimate.bubble(uh, a, L), problem.indicators(uh), rtol=1e-5)  # rounding times 1e8
+
+
 def test_load_without_an_equation_is_named() -> None:
     V = planar()
     u, v = arguments(V)
@@ -326,6 +323,10 @@ def test_load_without_an_equation_is_named() -> None:
         estimate.bubble(with_random_values(V), inner(grad(u), grad(v)) * dx(1), v * dx)
     with pytest.raises(ValueError, match=f"local problems of {V.num_cells} cells have no solution"):
         estimate.bubble(with_random_values(V), fem.Constant(V.mesh, 0.0) * u * v * dx, v * dx)
+    W = planar((2,))
+    one, other = (0.3 * g[0] + 0.7 * g[1] for g in arguments(W))
+    with pytest.raises(ValueError, match=f"local problems of {W.num_cells} cells have no solution"):
+        estimate.bubble(with_random_values(W), inner(grad(one), grad(other)) * dx, ufl.TestFunction(W)[0] * dx)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -340,6 +341,8 @@ def test_values_that_are_not_finite_are_seen_and_stay_where_they_are(value: floa
     hit = np.isin(np.arange(V.num_cells), np.concatenate(near))
     assert np.isnan(eta[hit]).all()
     np.testing.assert_array_equal(eta[~hit], usual[~hit])
+    zero = fem.Constant(V.mesh, 0.0)
+    np.testing.assert_array_equal(estimate.bubble(uh, zero * energy(u, v), zero * v * dx), np.where(hit, np.nan, 0.0))
     kappa = fem.Constant(V.mesh, value)
     assert np.isnan(estimate.bubble(with_random_values(V), kappa * energy(u, v), v * dx)).all()
 
@@ -480,7 +483,7 @@ def test_l_domain() -> None:
     adapt.solve(V, lambda V: poisson(V, exact, zero), indicators, steps=40, max_dofs=1000, progress=False)
     dofs, errors, effectivity = np.array(rows).T
     needed = np.exp(np.interp(-np.log(3e-4), -np.log(errors), np.log(dofs)))
-    assert needed < 950  # 885 were measured, and 777 in a run that the error itself drives
+    assert needed < 950  # 885 were measured, and 783 in a run that the error itself drives
     late = dofs > 380
     slope = np.polyfit(np.log(dofs[late]), np.log(errors[late]), 1)[0]
     assert -2.5 < slope < -1.5  # -1.9 was measured; -1.5 is optimal, and what was lost before is caught up

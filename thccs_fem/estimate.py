@@ -112,8 +112,8 @@ def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
     if singular.size:
         raise ValueError(
             f"the local problems of {singular.size} cells have no solution, the first that of cell {singular[0]} on "
-            f"face {V.cells.face[singular[0]]} of the control mesh: L has an integral over it, or one of a component, "
-            f"that a has none of, or coefficients are zero or so large that they overflow"
+            f"face {V.cells.face[singular[0]]} of the control mesh: L has an integral there, or one of a component, "
+            f"that a has none of, or the coefficients of a are zero"
         )
     return np.sqrt(squares)
 

@@ -374,25 +374,22 @@ static void swap(double *a, double *b)
   *b = c;
 }
 
-/* Make the largest entry of each row 1. Return the largest right-hand side then, or NaN where one entry is not finite. */
+/* Make the largest entry of each row 1. Return the sum of the absolute right-hand sides then. */
 static double scale_rows(int32_t n, double *a, double *b)
 {
-  double finite = 0.0, largest_side = 0.0;
+  double sum = 0.0;
   for (int32_t i = 0; i < n; ++i) {
     double largest = 0.0;
-    for (int32_t j = 0; j < n; ++j) {
-      finite += 0.0 * a[n * i + j];
-      largest = largest < fabs(a[n * i + j]) ? fabs(a[n * i + j]) : largest;
-    }
+    for (int32_t j = 0; j < n; ++j)
+      largest = fmax(largest, fabs(a[n * i + j]));
     if (largest > 0.0) {
       for (int32_t j = 0; j < n; ++j)
         a[n * i + j] /= largest;
       b[i] /= largest;
     }
-    finite += 0.0 * b[i];
-    largest_side = largest_side < fabs(b[i]) ? fabs(b[i]) : largest_side;
+    sum += fabs(b[i]);
   }
-  return largest_side + finite;
+  return sum;
 }
 
 /* Bring the largest of the entries from (s, s) on there, and return its size. */
@@ -415,8 +412,8 @@ static double pivot(int32_t n, int32_t s, double *a, double *b, double *r)
 /* r^T z with a z = b: Gauss' elimination, rows and columns pivoted. All of a, b and r is written over. */
 static double solved(int32_t n, double *a, double *b, double *r)
 {
-  const double largest = scale_rows(n, a, b);
-  if (isnan(largest))
+  const double scale = scale_rows(n, a, b);
+  if (!isfinite(scale))
     return NAN;
   int32_t rank = 0;
   for (; rank < n && pivot(n, rank, a, b, r) > SINGULAR; ++rank)
@@ -427,7 +424,7 @@ static double solved(int32_t n, double *a, double *b, double *r)
       b[i] -= factor * b[rank];
     }
   for (int32_t i = rank; i < n; ++i)
-    if (fabs(b[i]) > REMAINDER * largest)
+    if (fabs(b[i]) > REMAINDER * scale)
       return INFINITY;
   double product = 0.0;
   for (int32_t i = rank - 1; i >= 0; --i) {

@@ -55,7 +55,7 @@ int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *in
                               double *matrices, double *residuals);
 
 /* values[cell] = r^T z with matrix (n, n) z = r, r the residual (n), given twice: all three are written over. Infinite
-   where there is no z, NaN where an entry is not finite. A z that is not unique is 0 where nothing determines it. */
+   where there is no z, NaN where an r is not finite. A z that is not unique is 0 where nothing determines it. */
 void thccs_solve_local(int32_t num_cells, int32_t n, double *matrices, double *residuals, double *again,
                        double *values);
 
@@ -93,8 +93,8 @@ void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32
                         const int32_t *indices, int32_t *seen, int32_t *counts, const int32_t *offsets,
                         int32_t *columns);
 
-/* The rows of each cell as dense blocks over its columns. The block of cell c, width[c] wide, begins at values[starts[c]]. place (matrix columns) is scratch; values are 0
-   before. */
+/* The rows of each cell as dense blocks over its columns. The block of cell c, width[c] wide, begins at
+   values[starts[c]]. place (matrix columns) is scratch; values are 0 before. */
 void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
                       const int32_t *indices, const double *data, const int32_t *offsets, const int32_t *columns,
                       const int32_t *width, const int64_t *starts, int32_t *place, double *values);

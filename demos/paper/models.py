@@ -46,7 +46,7 @@ arguments.out.mkdir(parents=True, exist_ok=True)
 
 FULL = arguments.steps >= 10  # a run of a few steps has coarse stand-ins
 FOLDER = Path(os.environ["THCCS_MESHES"]) if FULL and os.environ.get("THCCS_MESHES") else None
-THETA = 0.4  # part of the estimate that a step refines
+THETA = 0.3  # part of the estimate that a step refines
 
 # %% [markdown]
 # ## Few EVs: unions of boxes
@@ -59,9 +59,9 @@ THETA = 0.4  # part of the estimate that a step refines
 # %%
 HAND = [
     [(0, 0, 0), (25, 6, 25)],
-    [(0, 0, 25), (5, 6, 44)],
-    [(6, 0, 25), (11, 6, 50)],
-    [(13, 0, 25), (18, 6, 48)],
+    [(0, 0, 25), (5, 6, 45)],
+    [(6, 0, 25), (11, 6, 51)],
+    [(13, 0, 25), (18, 6, 46)],
     [(20, 0, 25), (25, 6, 39)],
     [(-15, 0, 9), (0, 6, 15)],
 ]
@@ -313,8 +313,8 @@ for model in models:
 # %%
 by_name = {model.name: model for model in models}
 assert by_name["Genus-3"].counts == by_name["Genus-3"].paper
-if not FOLDER:
-    for name in ("Hand", "Bunny"):  # EVs and invalid elements are the paper's, the faces as many but for one
+for name in ("Hand", "Bunny"):  # a stand-in has the EVs and invalid elements of the paper, and faces but for one
+    if by_name[name].source == "stand-in":
         assert by_name[name].counts[2:] == by_name[name].paper[2:]
         assert abs(by_name[name].counts[1] - by_name[name].paper[1]) == 1
 for name in ("Venus", "Head"):
