@@ -58,29 +58,10 @@ if comm is not None and comm.size > 1:
 # ## The control mesh and the two patches
 #
 # The patches are sets of *control-mesh faces*: refinement does not change the problem. The built-in model carries them
-# as face tags 1 and 2. On any other mesh we take, in each connected part, the faces nearest to the two ends of its
-# longest axis.
-
+# as face tags 1 and 2. On any other mesh `mesh.end_faces` takes, in each connected part, the faces nearest to the two
+# ends of its longest axis.
 
 # %%
-def end_patches(msh: mesh.ControlMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return the faces at both ends of the longest axis of each connected part, about one in fifty."""
-    corners = np.repeat(np.arange(msh.num_faces), msh.face_sizes)
-    centres = np.zeros((msh.num_faces, msh.gdim))
-    np.add.at(centres, corners, msh.vertices[msh.face_vertices] / msh.face_sizes[corners][:, None])
-    part_of_face = msh.vertex_components[msh.face_vertices[msh.face_offsets[:-1]]]
-    ends: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for part in range(msh.num_components):
-        faces = np.flatnonzero(part_of_face == part)
-        x = centres[faces] - centres[faces].mean(axis=0)
-        along = x @ np.linalg.svd(x, full_matrices=False)[2][0]
-        order = faces[np.argsort(along, kind="stable")]
-        count = max(1, faces.size // 50)
-        ends[0].append(order[:count])
-        ends[1].append(order[-count:])
-    return np.concatenate(ends[0]), np.concatenate(ends[1])
-
-
 if arguments.mesh is None:
     msh = generators.genus3()
     cold, hot = (np.flatnonzero(msh.face_tags == tag) for tag in (1, 2))
@@ -88,7 +69,7 @@ else:
     msh = io.read_mesh(arguments.mesh)
     while msh.num_faces < 200 * msh.num_components:  # a coarse cage: subdivided, its limit surface is the same
         msh = subdivision.subdivided(msh)
-    cold, hot = end_patches(msh)
+    cold, hot = mesh.end_faces(msh)
 V = fem.functionspace(msh, ("THCCS", 3))
 print(f"{msh}\n{V}")
 

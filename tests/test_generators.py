@@ -18,12 +18,22 @@ from thccs_fem.mesh import ControlMesh
 
 Floats = npt.NDArray[np.float64]
 
+
+def lattice_surface(*slices: list[str], **arguments: Any) -> ControlMesh:
+    """Surface of unit cubes, one a "#": slices along x of rows along y of columns along z."""
+    inside = np.array([[list(row) for row in rows] for rows in slices]) == "#"
+    values = np.pad(np.where(inside, 1.0, -1.0), 1, constant_values=-1.0)
+    upper = np.array(values.shape) - 1.0
+    return generators.implicit_surface(lambda x: values.ravel(), values.shape, np.zeros(3), upper, **arguments)
+
+
 CLOSED = {
     "torus": generators.torus((5, 3)),
     "cube": generators.cube_sphere(1),
     "cube_sphere": generators.cube_sphere(4),
     "genus3_base": generators.genus3(levels=0),
     "genus3": generators.genus3(),
+    "cubes": lattice_surface(["##", "#."], ["..", "#."]),
 }
 L_DOMAINS = {
     "l_domain_coarse": generators.l_domain(1),
@@ -87,6 +97,7 @@ def same_points(one: npt.ArrayLike, other: npt.ArrayLike) -> bool:
         ("cube_sphere", (98, 96, 0), {3: 8}),
         ("genus3_base", (44, 48, 3), {8: 4}),
         ("genus3", (3068, 3072, 3), {8: 4}),
+        ("cubes", (20, 18, 0), {3: 12, 5: 2, 6: 1}),
     ],
 )
 def test_closed_counts(name: str, counts: tuple[int, ...], extraordinary: dict[int, int]) -> None:
@@ -94,7 +105,7 @@ def test_closed_counts(name: str, counts: tuple[int, ...], extraordinary: dict[i
     assert (mesh.num_vertices, mesh.num_faces, mesh.genus) == counts
     assert (mesh.num_components, mesh.boundary_loops) == (1, ())
     assert valences(mesh) == extraordinary
-    assert set(mesh.valences) <= {3, 4, 8}
+    assert set(mesh.valences) <= {3, 4, *extraordinary}
 
 
 @on(CLOSED)
@@ -121,6 +132,92 @@ def test_cube_sphere_is_equiangular() -> None:
     np.testing.assert_allclose(np.diff(angles), math.pi / 12, rtol=1e-12)
     assert same_points(mesh.vertices, mesh.vertices[:, [1, 2, 0]])
     assert areas(mesh).min() > 0.6 * areas(mesh).max()
+
+
+# Implicit surfaces
+
+
+def ball(n: int, **arguments: Any) -> ControlMesh:
+    return generators.implicit_surface(lambda x: 0.64 - (x**2).sum(axis=0), (n, n, n), **arguments)
+
+
+@pytest.mark.parametrize("n", [10, 20, 40])
+def test_implicit_surface_approximates_and_is_as_symmetric_as_its_function(n: int) -> None:
+    mesh, h = ball(n), 2 / (n - 1)
+    radius = np.linalg.norm(mesh.vertices, axis=1)
+    assert radius.max() < 0.8  # a mean of points that are interpolated linearly: both lie inside of what is convex
+    # Points of a cell are within sqrt(3) h / 2 of their mean, which lies (3 h^2 / 4) / (2 r) under the sphere at most;
+    # linear interpolation of f has an error of h^2 / 4, of a position that over the slope 2 r.
+    assert radius.min() > 0.8 - h**2 / (2 * 0.8)
+    assert same_points(mesh.vertices, mesh.vertices[:, [1, 2, 0]] * [1, -1, 1])
+    assert volume(mesh) == pytest.approx(4 / 3 * math.pi * 0.8**3, rel=3 * h**2)
+
+
+def test_implicit_surface_has_hundreds_of_extraordinary_vertices_and_invalid_faces() -> None:
+    mesh = ball(20)
+    assert 0.3 < len(mesh.extraordinary_vertices) / mesh.num_vertices < 0.6
+    assert 0.5 < mesh.num_invalid_faces / mesh.num_faces
+    assert set(valences(mesh)) == {3, 5, 6}
+    assert mesh.genus == 0
+
+
+def test_implicit_surface_of_a_box_is_a_cube_with_eight_extraordinary_vertices() -> None:
+    def box(x: Floats) -> Floats:
+        return 0.5 - abs(x).max(axis=0)
+
+    mesh = generators.implicit_surface(box, (9, 13, 17))
+    assert valences(mesh) == {3: 8}
+    # Positive are |x| < 0.5: 3, 5 and 7 points, at whose middles faces lie; f is linear across the sides.
+    assert mesh.num_faces == 2 * (3 * 5 + 3 * 7 + 5 * 7)
+    smooth = mesh.valences[mesh.quads].min(axis=1) == 4
+    inner = np.abs(mesh.vertices).max(axis=1)[np.unique(mesh.quads[smooth])]
+    np.testing.assert_allclose(inner.max(), 0.5, rtol=1e-14)
+
+
+def test_implicit_surface_finds_genus_and_components() -> None:
+    def tori(x: Floats) -> Floats:
+        return 0.1 - np.hypot(np.hypot(abs(x[0]) - 1.0, x[1]) - 0.5, x[2])
+
+    mesh = generators.implicit_surface(tori, (70, 41, 10), (-2, -1, -0.2), (2, 1, 0.2))
+    assert (mesh.num_components, mesh.genus) == (2, 2)
+
+
+def test_cubes_that_meet_in_an_edge_or_a_corner_only_are_joined() -> None:
+    for slices in (
+        (["##", "#."],),  # in a face: nothing is added
+        (["#.", ".#"],),  # in an edge
+        (["#.", ".."], ["..", ".#"]),  # in a corner
+        (["##", "##"], ["#.", "##"], ["##", "##"]),
+        (["..", "##"], [".#", "##"], ["##", "##"]),
+        ([".#", "##"], ["##", "#."]),  # all but the ends of a diagonal
+    ):
+        mesh = lattice_surface(*slices)
+        assert (mesh.num_components, mesh.genus) == (1, 0)
+    assert lattice_surface(["#.", ".#"]).num_faces == lattice_surface(["##", "##"]).num_faces
+    assert lattice_surface(["#.", ".."], ["..", ".#"]).num_faces == 24
+    assert lattice_surface(["##", "#."]).num_faces == 14
+
+
+@given(st.integers(0, 10_000), st.floats(0.1, 0.9))
+def test_implicit_surface_is_manifold_whatever_the_signs(seed: int, share: float) -> None:
+    inside = np.random.default_rng(seed).random((5, 4, 4)) < share
+    slices = [["".join(".#"[point] for point in row) for row in rows] for rows in inside.astype(int)]
+    if not inside.any():
+        slices = [["#"]]
+    mesh = lattice_surface(*slices)  # raises if an edge has not two faces or a vertex not one fan of them
+    assert not mesh.boundary_edges.size
+    assert set(mesh.valences) <= {3, 4, 5, 6}
+    assert volume(mesh) > 0
+
+
+def test_smoothing_rounds_off_and_keeps_the_volume() -> None:
+    cube = ["#" * 8] * 8
+    sharp, rounded = lattice_surface(*[cube] * 8), lattice_surface(*[cube] * 8, smoothing=80)
+    np.testing.assert_array_equal(rounded.quads, sharp.quads)
+    assert volume(rounded) == pytest.approx(volume(sharp), rel=0.05)
+    reach_before, reach_after = (np.linalg.norm(mesh.vertices - 4.5, axis=1).max() for mesh in (sharp, rounded))
+    assert reach_after < 0.95 * reach_before
+    assert volume(ball(20, smoothing=20)) == pytest.approx(volume(ball(20)), rel=0.01)
 
 
 # Genus 3
@@ -372,6 +469,7 @@ def test_l_domain2_rim_is_spaced_evenly_outside_and_grows_from_the_corner() -> N
 # Arguments
 
 MAKERS: dict[str, Callable[..., ControlMesh]] = {
+    "ball": lambda **comm: ball(10, smoothing=3, **comm),
     "torus": lambda **comm: generators.torus((4, 3), **comm),
     "cube_sphere": lambda **comm: generators.cube_sphere(1, **comm),
     "genus3": lambda **comm: generators.genus3(**comm),
@@ -416,6 +514,14 @@ def test_meshes_are_repeatable(make: Callable[..., ControlMesh]) -> None:
         (lambda make: make.rectangle((1, 1), (0, 0), (1, 0)), ValueError, r"lower less than"),
         (lambda make: make.rectangle((1, 1), (0, 0, 0)), ValueError, r"two finite coordinates"),
         (lambda make: make.rectangle((1, 1), (0, math.nan)), ValueError, r"two finite coord"),
+        (lambda make: make.implicit_surface(abs, (3, 3)), TypeError, r"expected three integers \(n, m, k\)"),
+        (lambda make: make.implicit_surface(abs, (3, 2, 3)), ValueError, r"shape\[1\] is 2: expected 3 or more"),
+        (lambda make: make.implicit_surface(abs, (3, 3, 3), (0, 0)), ValueError, r"three finite coordinates"),
+        (lambda make: make.implicit_surface(abs, (3, 3, 3), smoothing=-1), ValueError, r"smoothing is -1"),
+        (lambda make: make.implicit_surface(lambda x: x[0], (3, 3, 3)), ValueError, r"positive on the sides"),
+        (lambda make: make.implicit_surface(lambda x: -(x[0] ** 2), (3, 3, 3)), ValueError, r"positive at no point"),
+        (lambda make: make.implicit_surface(lambda x: x[0] * np.nan, (3, 3, 3)), ValueError, r"27 values that are not"),
+        (lambda make: make.implicit_surface(lambda x: x, (3, 3, 3)), ValueError, r"f returned 81 values for 27 points"),
         (lambda make: make.disc("3"), TypeError, r"n is '3': expected an integer"),
         (lambda make: make.wheel(2, 3), ValueError, r"valence is 2: expected 3 or more"),
         (lambda make: make.wheel(5, 0), ValueError, r"n is 0: expected 1 or more"),

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import ufl
-from thccs_fem import io
-from thccs_fem.mesh import ControlMesh, orient
+from thccs_fem import generators, io
+from thccs_fem.mesh import ControlMesh, end_faces, orient
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -130,7 +130,7 @@ def test_faces_of_several_sizes_in_any_kind_of_sequence() -> None:
     assert not msh.is_quad
     assert (msh.euler_characteristic, msh.genus) == (2, 0)
     assert msh.extraordinary_vertices == {0: 3, 1: 3, 2: 3, 3: 3}
-    assert msh.num_invalid_faces == 5
+    assert (msh.invalid_faces.tolist(), msh.num_invalid_faces) == ([0, 1, 2, 3, 4], 5)
     with pytest.raises(ValueError, match="faces 1, 2, 3, 4 do not have four corners"):
         _ = msh.quads
 
@@ -142,6 +142,39 @@ def test_statistics_of_a_closed_surface() -> None:
     assert (msh.extraordinary_vertices, msh.num_invalid_faces) == ({}, 0)
     numbers = (msh.genus, msh.num_components, msh.euler_characteristic, msh.num_invalid_faces)
     assert {type(number) for number in numbers} == {int}
+
+
+def test_invalid_faces_have_two_extraordinary_vertices_inside() -> None:
+    # The cube's vertices are three faces apart after a cut of each edge into three, and one after none.
+    assert generators.cube_sphere(1).invalid_faces.tolist() == [0, 1, 2, 3, 4, 5]
+    assert generators.cube_sphere(3).invalid_faces.tolist() == []
+    assert generators.wheel(5, 2).invalid_faces.tolist() == []  # vertices on the rim are not counted
+
+
+def test_end_faces_are_at_both_ends_of_each_component() -> None:
+    plane, faces = grid(10, 2)
+    above = plane @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + np.array([0.0, 100.0])  # along y, upwards
+    msh = ControlMesh(np.concatenate([plane, above]), np.concatenate([faces, faces + len(plane)]))
+    centres = msh.vertices[msh.quads].mean(axis=1)
+    first, last = end_faces(msh, share=0.1)
+    assert (first.size, last.size) == (4, 4)
+    assert (np.diff(first) > 0).all()
+    np.testing.assert_allclose(np.sort(centres[first, 0])[-2:], plane[:, 0].min() + 0.5)
+    for own, coordinate in ((centres[:, 1] < 50, 0), (centres[:, 1] > 50, 1)):
+        low, high = (centres[end[own[end]], coordinate] for end in (first, last))
+        assert low.size == high.size == 2
+        assert low.max() == centres[own, coordinate].min()
+        assert high.min() == centres[own, coordinate].max()
+
+
+def test_end_faces_are_one_at_least_and_need_two() -> None:
+    first, last = end_faces(ControlMesh(*grid(2, 1)))
+    assert (first.tolist(), last.tolist()) == ([0], [1])
+    with pytest.raises(ValueError, match="face 0 is a component of its own"):
+        end_faces(ControlMesh(*grid(1, 1)))
+    for share in (0.0, 0.6):
+        with pytest.raises(ValueError, match=rf"share is {share}: expected"):
+            end_faces(ControlMesh(*grid(2, 1)), share)
 
 
 def test_components_and_loops_are_counted_over_all_of_them() -> None:

@@ -19,10 +19,12 @@ ANY = inspect.Parameter.empty
 SIGNATURES = {
     "mesh.ControlMesh": ("vertices, faces, face_tags=None, edge_tags=None, creases=None, corners=None, comm=None"),
     "mesh.ControlMesh.ufl_domain": "self",
+    "mesh.end_faces": "msh, /, share=ANY",
     "mesh.orient": "vertices, faces",
     "generators.torus": "shape, /, R=2, r=1",
     "generators.cube_sphere": "n",
     "generators.genus3": "",
+    "generators.implicit_surface": "f, shape, lower=ANY, upper=ANY, *, smoothing=0",
     "generators.rectangle": "shape, /",
     "generators.disc": "n",
     "generators.wheel": "valence, n",

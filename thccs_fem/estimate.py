@@ -58,7 +58,8 @@ def error(
 def residual(uh: Function, strong_residual: ufl.core.expr.Expr, neumann: ufl.core.expr.Expr | None = None) -> Floats:
     """Return the residual indicators of a second-order problem: h_K times the L2 norm of the strong residual on K.
 
-    The space is C1, so that no jumps across element edges arise.  h_K is the root of the area of the cell.
+    The space is C1, so that no jumps across element edges arise.  h_K is the root of the area of the cell.  Near a
+    reentrant corner second derivatives are not square-integrable: there the residual grows with the level of the caps.
 
     Args:
         uh: The approximation; the indicators belong to its cells.

@@ -220,7 +220,7 @@ def implicit_surface(
     Raises:
         TypeError: The shape is not three integers, or smoothing is none.
         ValueError: A count is too small, the corners are wrong, or f is positive nowhere, on the
-            sides of the box, or not finite.
+            sides of the box, not finite, or of the wrong shape.
 
     >>> ball = implicit_surface(lambda x: 0.8 - (x**2).sum(axis=0), (20, 20, 20))
     >>> ball.euler_characteristic, ball.num_faces, len(ball.extraordinary_vertices)
@@ -230,8 +230,10 @@ def implicit_surface(
     _check_count("smoothing", smoothing, minimum=0)
     axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"))
-    values = np.asarray(f(points.reshape(3, -1)), dtype=np.float64).reshape(counts)
-    vertices, quads = _surface_net(_filled(values))
+    values = np.asarray(f(points.reshape(3, -1)), dtype=np.float64)
+    if values.size != points[0].size:
+        raise ValueError(f"f returned {values.size} values for {points[0].size} points: expected one for each")
+    vertices, quads = _surface_net(_filled(values.reshape(counts)))
     scaled = low + vertices * (high - low) / (np.array(counts) - 1)
     return ControlMesh(_smoothed(scaled, quads, smoothing), quads, comm=comm)
 
@@ -299,7 +301,7 @@ def _surface_net(values: Floats) -> tuple[Floats, Ints]:
     number = np.bincount(corner.ravel())
     sums = [np.bincount(corner.ravel(), weights=x) for x in place.T]
     order = np.argsort(corner.min(axis=1), kind="stable")
-    return np.column_stack(sums) / number[:, None], corner[order]
+    return np.column_stack(sums) / number[:, None], corner[order].astype(np.int32)
 
 
 def _smoothed(vertices: Floats, quads: Ints, times: int) -> Floats:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thccs_fem import mesh
+from thccs_fem.polygons import Pair
 from thccs_fem.vtk import write_vtu
 
 __all__ = ["read_mesh", "write_vtu"]
@@ -39,7 +40,7 @@ class _Surface:
     vertices: Floats
     faces: Faces
     face_tags: Sequence[int] | Indices | None = None
-    edge_tags: Mapping[mesh.Pair, int] = field(default_factory=dict)
+    edge_tags: Mapping[Pair, int] = field(default_factory=dict)
 
 
 def read_mesh(
@@ -581,7 +582,7 @@ def _face_blocks(path: Path, blocks: list[Any]) -> list[int]:
 
 def _tagged_edges(
     path: Path, blocks: list[Any], groups: list[Indices], used: Indices, cells: list[Indices]
-) -> dict[mesh.Pair, int]:
+) -> dict[Pair, int]:
     """Return the tags of those lines of the file that are edges of its faces.
 
     Args:

@@ -142,8 +142,8 @@ for name, msh in meshes.items():
         print(f"{name}, {rule}: {errors}; rate {rate(curve):.2f}, in the last step {rate(curve[-2:]):.2f}")
 
 # %% [markdown]
-# Rates fall towards 2/3 from above, 0.9 in the first step and 0.8 in the third; a rate near the paper's comes out of
-# any few levels of this.
+# Rates fall from 0.9 towards the theory's 2/3, and are 0.79 and 0.77 in the last step here. Which levels the paper's
+# rates were fitted to we do not know; ours are near, and on the same side of everything that is to come.
 #
 # ## One function a step
 #
@@ -161,27 +161,38 @@ for name, msh in meshes.items():
         curves[name, "adaptive", rule] = np.array([(step.dofs, step.estimate) for step in history.steps])
 
 TABLE_1 = {"L-domain1": 5, "L-domain2": 3}  # levels that the paper's runs came to
-print(f"{'mesh':10} {'quadrature':13} {'step':>4} {'levels':>6} {'(paper)':>7} {'elements':>8} {'dofs':>5} {'L2 error':>9}")
+print("mesh       quadrature    step levels (paper) elements  dofs  L2 error")
 for (name, rule), history in histories.items():
     for step in history.steps:
         if step.number in (0, 20, arguments.steps):
             counts = f"{step.number:4d} {step.levels:6d} {TABLE_1[name]:7d} {step.elements:8d} {step.dofs:5d}"
             print(f"{name:10} {rule:13} {counts} {step.estimate:9.2e}")
 
+changed_by_rule = {
+    (name, refinement): abs(curves[name, refinement, "paper's rule"][:, 1] / curve[:, 1] - 1).max()
+    for (name, refinement, rule), curve in curves.items()
+    if rule == "caps"
+}
+for (name, refinement), change in changed_by_rule.items():
+    print(f"{name}, {refinement}: the paper's rule changes the error by {100 * change:.1f} % at most")
+
 # %% [markdown]
-# After 20 steps L-domain1 has the 5 levels of the paper's Table 1, and an error for which uniform refinement would need
-# ten times the dofs. L-domain2 has 5 where the paper has 3; it has as many elements at the corner as L-domain1, and
-# nothing else calls for refinement. The paper's quadrature hardly matters: at the corner it is even a little better
-# than ours with a cap at level 4 would be, and far from it nothing depends on it at this accuracy.
+# After 20 steps L-domain1 has the 5 levels of the paper's Table 1, after 40 it has 6, with errors for which uniform
+# refinement would need 9 and 27 times the dofs. L-domain2 has 3 levels, as the paper's, up to step 8 only, 5 after 20
+# and 6 after 40: our mesh is another one, and what it needs first is levels at the corner. The quadrature hardly
+# matters: nothing changes on L-domain1, and at most 5 % on L-domain2. That is different where the error at
+# extraordinary vertices is all there is, as in `patch_test.py`.
 #
 # ## Pictures
 #
-# The L2 error on each element after the last step (fig. 8 d and e), on a scale of powers of ten: the error is spread
-# evenly, up to the corner itself and the rim.
+# The L2 error on each element after the last step (fig. 8 d and e), on a scale of powers of ten. Six levels at the
+# corner have done away with the error there: the largest ones are now along the rim, where plain Catmull-Clark
+# functions are poor, whatever is refined inside.
 
 # %%
 for name in meshes:
     uh = histories[name, "caps"].solution
+    assert uh is not None
     eta = estimate.error(uh, exact, "L2")
     file = arguments.out / f"{name.lower().replace('-', '_')}_error.png"
     plot.plot(uh.function_space, file, cell_data={"log10 of error": np.log10(eta)})
@@ -196,15 +207,17 @@ axes = figure.subplots()
 for (name, refinement, rule), curve in curves.items():
     color = "tab:blue" if name == "L-domain1" else "tab:orange"
     if rule == "caps":
-        axes.loglog(*curve.T, ".--" if refinement == "uniform" else ".-", color=color, label=f"{name}, {refinement}")
+        style = ".--" if refinement == "uniform" else ".-"
+        axes.loglog(*curve.T, style, color=color, label=f"{name}, {refinement}")
     else:
-        axes.loglog(*curve[::5].T, "x", color=color, label="the same, paper's rule" if refinement == "adaptive" else None)
-dofs, error = curves["L-domain1", "uniform", "caps"][0]
-span = np.array([dofs, 80 * dofs])
+        label = "the same, paper's rule" if refinement == "adaptive" else None
+        axes.loglog(*curve[::5].T, "x", color=color, label=label)
+dofs, error = curves["L-domain1", "uniform", "caps"][-1]
+span = np.array([dofs / 50, dofs])
 for paper, style in ((0.63, ":"), (0.75, "-.")):
-    axes.loglog(span, 1.6 * error * (span / dofs) ** -paper, style, color="grey", label=f"rate {paper}, the paper's")
+    axes.loglog(span, 1.2 * error * (span / dofs) ** -paper, style, color="grey", label=f"rate {paper}, the paper's")
 axes.set(xlabel="dofs", ylabel="L2 error", title="L-domain: one function refined a step, against all of them")
-axes.legend()
+axes.legend(loc="lower left", fontsize="small")
 figure.savefig(arguments.out / "l_domain_convergence.png", dpi=150)
 
 # %% [markdown]
@@ -217,9 +230,7 @@ for name in meshes:
     uniform, adaptive = (curves[name, refinement, "caps"] for refinement in ("uniform", "adaptive"))
     assert 0.63 < rate(uniform) < 1.0, rate(uniform)
     assert rate(adaptive) > 1.5, rate(adaptive)
-    for refinement in ("uniform", "adaptive"):
-        same = curves[name, refinement, "paper's rule"][:, 1] / curves[name, refinement, "caps"][:, 1]
-        assert (abs(same - 1) < 0.1).all(), same
+assert max(changed_by_rule.values()) < 0.1
 if arguments.steps >= 20:
     assert histories["L-domain1", "caps"].steps[20].levels == TABLE_1["L-domain1"]
     assert histories["L-domain2", "caps"].steps[20].levels >= TABLE_1["L-domain2"]
