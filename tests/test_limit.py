@@ -14,7 +14,8 @@ from zoo import ZOO, grid, half_disc, polycube, prism, pyramid, torus, wheel
 
 from thccs_fem import limit
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import CHILD_AXES, CHILD_ORIGIN, Level, control_level, subdivide
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN
+from thccs_fem.subdivision import Level, control_level, subdivide
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]

@@ -15,19 +15,8 @@ from zoo import ZOO, grid, half_disc, l_domain, polycube, polygons, prism
 
 from thccs_fem import io
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import (
-    CHILD_AXES,
-    CHILD_ORIGIN,
-    FAR,
-    Level,
-    Step,
-    child_at,
-    control_level,
-    in_quads,
-    in_sub_quads,
-    neighbourhood,
-    subdivide,
-)
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, in_quads, in_sub_quads
+from thccs_fem.subdivision import FAR, Level, Step, control_level, neighbourhood, subdivide
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.float64]

@@ -23,7 +23,8 @@ from thccs_fem import element, jit
 from thccs_fem.bezier import bezier_masks, spline_grid
 from thccs_fem.hierarchy import Hierarchy, Stage
 from thccs_fem.limit import evaluate_patches
-from thccs_fem.subdivision import CHILD_AXES, CHILD_ORIGIN, Bools, Ints, child_at
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at
+from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["Batch", "Cells", "evaluate_pieces", "extract"]
 

@@ -38,17 +38,8 @@ from thccs_fem.boundary import (
     traces_meeting,
 )
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import (
-    Bools,
-    Ints,
-    Level,
-    Step,
-    control_level,
-    in_quads,
-    in_sub_quads,
-    neighbourhood,
-    subdivide,
-)
+from thccs_fem.positions import in_quads, in_sub_quads
+from thccs_fem.subdivision import Bools, Ints, Level, Step, control_level, neighbourhood, subdivide
 
 __all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
 
@@ -160,7 +151,7 @@ class Hierarchy:
     def root_position(
         self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
     ) -> tuple[Ints, npt.NDArray[np.float64]]:
-        """Return face of level 0 and coordinates there; arguments as for `subdivision.in_sub_quads`."""
+        """Return face of level 0 and coordinates there; arguments as for `positions.in_sub_quads`."""
         return (in_sub_quads if self.root_is_subdivided else in_quads)(self.mesh, faces, uv, corner)
 
     @cached_property

@@ -28,17 +28,8 @@ from thccs_fem.bezier import VERTEX_PLACE, bezier_masks, spline_grid
 from thccs_fem.boundary import Boundary
 from thccs_fem.element import TO_BERNSTEIN
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import (
-    Bools,
-    Ints,
-    Level,
-    child_at,
-    control_level,
-    in_quads,
-    in_sub_quads,
-    neighbourhood,
-    subdivide,
-)
+from thccs_fem.positions import child_at, in_quads, in_sub_quads
+from thccs_fem.subdivision import Bools, Ints, Level, control_level, neighbourhood, subdivide
 
 __all__ = ["evaluate", "evaluate_patches"]
 
