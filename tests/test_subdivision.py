@@ -11,11 +11,11 @@ from exact import ExactMesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
-from zoo import ZOO, grid, half_disc, l_domain, polycube, polygons, prism
+from zoo import ZOO, grid, half_disc, l_domain, polycube, prism
 
 from thccs_fem import io
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, in_quads, in_sub_quads
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN
 from thccs_fem.subdivision import FAR, Level, Step, control_level, neighbourhood, subdivide
 
 Bools = npt.NDArray[np.bool_]
@@ -231,49 +231,6 @@ def test_children_of_a_square_lie_where_origin_and_axes_say() -> None:
     points = (step.matrix @ corners)[step.fine.quads]  # the step moves no vertex here: all are corners
     expected = CHILD_ORIGIN[:, None] + np.einsum("kij,cj->kci", CHILD_AXES, corners) / 2
     np.testing.assert_array_equal(points, expected)
-
-
-COORDINATE = st.floats(0.0, 1.0)
-
-
-@given(COORDINATE, COORDINATE)
-def test_coordinates_in_children_are_exact(u: float, v: float) -> None:
-    child, local = child_at(np.array([[u, v]]))
-    assert ((local >= 0) & (local <= 1)).all()
-    # Twice the distance from the corner, which is exact: u - 1 for u >= 1/2 does not round.
-    assert sorted(local[0]) == sorted([2 * u if u < 0.5 else 2 * (1 - u), 2 * v if v < 0.5 else 2 * (1 - v)])
-    back = CHILD_ORIGIN[child] + np.einsum("nij,nj->ni", CHILD_AXES[child], local) / 2
-    np.testing.assert_array_equal(back, [(u, v)])
-
-
-def test_positions_in_sub_quads_and_in_quads() -> None:
-    mesh = grid(2, 1)
-    faces, uv = np.array([1, 0, 1]), np.array([(0.25, 0.125), (0.75, 0.25), (0.5, 1.0)])
-    half_edges, local = in_sub_quads(mesh, faces, uv)
-    np.testing.assert_array_equal(half_edges, [4, 1, 6])
-    np.testing.assert_array_equal(local, [(0.5, 0.25), (0.5, 0.5), (1.0, 0.0)])
-    faces_again, uv_again = in_quads(mesh, half_edges // 4, local, half_edges % 4)
-    np.testing.assert_array_equal(faces_again, faces)
-    np.testing.assert_array_equal(uv_again, uv)
-    np.testing.assert_array_equal(in_quads(mesh, faces, uv)[1], uv)
-    half_edges, local = in_sub_quads(mesh, faces, uv, [-1, 2, 0])
-    np.testing.assert_array_equal(half_edges, [4, 2, 4])
-    np.testing.assert_array_equal(local, [(0.5, 0.25), (0.75, 0.25), (0.5, 1.0)])
-
-
-@pytest.mark.parametrize("function", [in_quads, in_sub_quads])
-def test_wrong_positions_are_refused(function: Callable[..., object]) -> None:
-    mesh = polygons()
-    with pytest.raises(ValueError, match="point 1 is on face 5; the mesh has faces 0 to 4"):
-        function(mesh, [1, 5], [(0.0, 0.0)] * 2)
-    with pytest.raises(ValueError, match=r"face 4 with 5 corners and names corner -1; .* corner from 0 to 4"):
-        function(mesh, [4], [(0.0, 0.0)])
-    with pytest.raises(ValueError, match=r"point 0 has coordinates \[-0.1  0. \]"):
-        function(mesh, [1], [(-0.1, 0.0)])
-    with pytest.raises(ValueError, match=r"uv must have shape \(1, 2\)"):
-        function(mesh, [1], (0.0, 0.0))
-    with pytest.raises(TypeError, match="must be integers"):
-        function(mesh, [1.5], [(0.0, 0.0)])
 
 
 # Tags -----------------------------------------------------------------------------------------------------------------
