@@ -61,6 +61,7 @@ SIGNATURES = {
     "fem.petsc.set_bc": "b, bcs, /",
     "estimate.error": "uh, u_exact, norm='L2'",
     "estimate.residual": "uh, strong_residual, neumann=None",
+    "estimate.bubble": "uh, a, L",
     "estimate.norm": "V, eta",
     "adapt.mark": "V, eta, strategy='dorfler', theta=0.5",
     "adapt.refine": "V, marked",

@@ -82,7 +82,7 @@ def residual(uh: Function, strong_residual: ufl.core.expr.Expr, neumann: ufl.cor
 def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
     """Return the bubble indicators: the energy norms of the error's projections onto four bubble functions a cell.
 
-    In each cell (and with a mixed a in all components together) the local problem for a combination z of bubbles is
+    In each cell, for all components together, the local problem for a combination z of bubbles is
 
         a(z, b) = L(b) - a(uh, b)    for all bubbles b of the cell,        eta^2 = |a(z, z)|,
 
@@ -133,7 +133,7 @@ def _check_problem(V: FunctionSpace, a: Form, L: Form) -> None:
         if _has_second_derivatives(given):
             raise ValueError(
                 "a or L has second derivatives of the test function, but bubbles are not smooth enough across edges "
-                "for fourth-order equations: use estimate.residual"
+                "for fourth-order equations: multiply estimate.residual by the size of the cells instead"
             )
 
 

@@ -207,8 +207,8 @@ for column, (name, table) in enumerate(tables.items()):
 figure.savefig(arguments.out / "bubble_estimator.png", dpi=130)
 
 # %% [markdown]
-# The indicators of the last step on the sphere, seen from the bump: they span many powers of ten far from it, where
-# there is nothing to resolve, but hardly two near it. That is what marking aims at.
+# The indicators of the last step on the sphere, seen from the bump: near it they differ by two powers of ten or so, and
+# fall off where there is nothing to resolve. That is what marking aims at.
 
 # %%
 eta = bubbles_of(solutions["sphere"], problems["sphere"])
