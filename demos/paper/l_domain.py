@@ -143,7 +143,7 @@ for name, msh in meshes.items():
 
 # %% [markdown]
 # Rates fall from 0.9 towards the theory's 2/3, and are 0.79 and 0.77 in the last step here. Which levels the paper's
-# rates were fitted to we do not know; ours are near, and on the same side of everything that is to come.
+# rates were fitted to we do not know.
 #
 # ## One function a step
 #
