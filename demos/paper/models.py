@@ -246,7 +246,7 @@ class Laplace:
 # %%
 @dataclass
 class Run:
-    """What came of an adaptive run. Not its spaces: those with hundreds of EVs take 200 MB each."""
+    """What came of an adaptive run. Not its spaces: those with hundreds of EVs take 150 MB each."""
 
     steps: list[adapt.Step]
     energies: list[float]
@@ -318,9 +318,8 @@ for name, after in preprocessed.items():
 # %% [markdown]
 # ## Pictures (figs. 9 to 13)
 #
-# The first and the last solution of each direct run, with the elements, are in the directory of the results. The dofs
-# have gone to the kinks around the patches, above all to their corners, whatever the EVs there, and hardly anywhere
-# else.
+# The first and the last solution of each direct run, with the elements, are in the directory of the results. Solutions
+# have kinks around the patches: there the new elements are, the finest at the corners of the patches, whatever the EVs.
 
 # %% [markdown]
 # ## Check
