@@ -52,7 +52,7 @@ def by_stam(u: fem.Function, second: bool) -> dict[int, float]:
             continue
         assert corner[0] == 0  # of a face that begins at the extraordinary vertex
         vertices = stam.stencil(level, np.array([4 * face], dtype=np.int32))[0]
-        coefficients = (stage.to_points @ (hierarchy.coefficients[l] @ u.x.array))[vertices]
+        coefficients = (stage.boundary.to_points @ (hierarchy.coefficients[l] @ u.x.array))[vertices]
         functions = stam.evaluate(len(vertices) // 2 - 4, POINTS, 2)
         x, w = functions @ hierarchy.points[l][vertices], functions @ coefficients
         J = x[1:3].transpose(1, 2, 0)  # [point, coordinate, parameter]

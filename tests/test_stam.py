@@ -251,7 +251,7 @@ def test_pieces_are_those_of_the_library(valence: int, rule: str) -> None:
         active = np.isin(half_edges // 4, stage.active_faces)
         if active.any():
             irregular = half_edges[active]
-            coefficients = (stage.to_points @ hierarchy.coefficients[l])[: stage.level.num_vertices].toarray()
+            coefficients = (stage.boundary.to_points @ hierarchy.coefficients[l])[: stage.level.num_vertices].toarray()
             vertices = stam.stencil(stage.level, irregular)
             for half_edge, mine in zip(irregular, vertices, strict=True):
                 cell = int(np.flatnonzero((cells.level == l) & (cells.level_face == half_edge // 4))[0])

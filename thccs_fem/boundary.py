@@ -101,6 +101,11 @@ class Boundary:
         return np.where((self.first >= 0) & self.level.corner, self.first + 1, self.first).astype(np.int32)
 
     @cached_property
+    def to_points(self) -> sp.csr_array:
+        """T of `from_dofs`, made once."""
+        return from_dofs(self)
+
+    @cached_property
     def smooth_edges(self) -> tuple[Ints, Ints]:
         """Free smooth rim vertices and the vertex w across from each, two arrays of the same shape."""
         level = self.level

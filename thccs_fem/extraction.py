@@ -336,7 +336,7 @@ def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Float
     """
     stage = hierarchy.stages[l]
     level, points = stage.level, hierarchy.points[l]
-    coefficients = sp.csr_array(stage.to_points @ hierarchy.coefficients[l])
+    coefficients = sp.csr_array(stage.boundary.to_points @ hierarchy.coefficients[l])
     plain = level.regular & ~level.boundary
     regular = plain[level.quads[faces]].all(axis=1)
     grid = spline_grid(level, faces[regular])

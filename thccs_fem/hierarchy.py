@@ -31,7 +31,6 @@ import scipy.sparse as sp
 from thccs_fem.boundary import (
     Boundary,
     BoundaryRule,
-    from_dofs,
     subdivision_matrix,
     support_of_traces,
     to_dofs,
@@ -74,11 +73,6 @@ class Stage:
     matrix: sp.csr_array | None
     selected: Bools
     active: Bools
-
-    @cached_property
-    def to_points(self) -> sp.csr_array:
-        """T: from the dof functions q to (P, delta), shape (num_functions, num_functions)."""
-        return from_dofs(self.boundary)
 
     @property
     def active_faces(self) -> Ints:
@@ -348,7 +342,7 @@ def _dof_step(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_array:
     """Return T_{l+1}^-1 S_l T_l."""
     if not coarse.vertex.size and not fine.vertex.size:
         return step.matrix
-    return sp.csr_array(to_dofs(fine) @ subdivision_matrix(coarse, fine, step) @ from_dofs(coarse))
+    return sp.csr_array(to_dofs(fine) @ subdivision_matrix(coarse, fine, step) @ coarse.to_points)
 
 
 def _meeting(boundary: Boundary, faces: Bools) -> Bools:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.polygons import following_corners
 
 __all__ = [
     "Bools",
@@ -98,9 +99,7 @@ class Level:
     @cached_property
     def following(self) -> Ints:
         """Next half-edge around the same face, shape (num_half_edges,)."""
-        following = np.arange(1, self.vertices.size + 1, dtype=np.int32)
-        following[self.offsets[1:] - 1] = self.offsets[:-1]
-        return following
+        return following_corners(self.offsets)
 
     @cached_property
     def previous(self) -> Ints:
@@ -173,12 +172,10 @@ def control_level(mesh: ControlMesh) -> Level:
     """
     _refuse_unsupported_sharpness(mesh)
     vertices = mesh.face_vertices
-    faces = np.diff(mesh.face_offsets)
-    following = np.arange(1, vertices.size + 1)
-    following[mesh.face_offsets[1:] - 1] = mesh.face_offsets[:-1]
-    twins = _twins(vertices, vertices[following], mesh.num_vertices)
+    following = following_corners(mesh.face_offsets)
+    twins = _twins(mesh)
     rim = twins < 0
-    num_faces = np.bincount(vertices, minlength=mesh.num_vertices).astype(np.int32)
+    num_faces = mesh.vertex_num_faces
     boundary = np.zeros(mesh.num_vertices, dtype=bool)
     boundary[vertices[rim]] = True
     corner = boundary & (num_faces == 1)
@@ -189,7 +186,7 @@ def control_level(mesh: ControlMesh) -> Level:
         offsets=mesh.face_offsets,
         vertices=vertices,
         twins=twins,
-        keys=np.arange(faces.size, dtype=np.int64),
+        keys=np.arange(mesh.num_faces, dtype=np.int64),
         boundary_edge=np.where(rim, np.arange(rim.size), -1).astype(np.int32),
         vertex_num_faces=num_faces,
         boundary=boundary,
@@ -214,14 +211,15 @@ def _refuse_unsupported_sharpness(mesh: ControlMesh) -> None:
         )
 
 
-def _twins(start: Ints, end: Ints, num_vertices: int) -> Ints:
-    """Return the opposite half-edge of each, -1 where there is none; the mesh is oriented and manifold."""
-    forward = start.astype(np.int64) * num_vertices + end
-    backward = end.astype(np.int64) * num_vertices + start
-    order = np.argsort(forward, kind="stable")
-    place = np.minimum(np.searchsorted(forward, backward, sorter=order), forward.size - 1)
-    candidate = order[place]
-    return np.where(forward[candidate] == backward, candidate, -1).astype(np.int32)
+def _twins(mesh: ControlMesh) -> Ints:
+    """Return the opposite half-edge of each, -1 where there is none."""
+    edge = mesh.face_edges
+    half_edges = np.arange(edge.size, dtype=np.int32)
+    first, last = (np.zeros(mesh.num_edges, dtype=np.int32) for _ in range(2))
+    first[edge[::-1]] = half_edges[::-1]  # of what is written to one place the last value stays
+    last[edge] = half_edges
+    other = first[edge] + last[edge] - half_edges
+    return np.where(other == half_edges, -1, other).astype(np.int32)
 
 
 def _rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:

@@ -17,7 +17,7 @@ import scipy.sparse.linalg as spla
 
 import ufl
 from thccs_fem import element
-from thccs_fem.extraction import Cells
+from thccs_fem.extraction import Cells, evaluate_pieces
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.function import Constant
 from thccs_fem.fem.space import Component, FunctionSpace
@@ -89,8 +89,9 @@ def boundary_dofs(V: FunctionSpace, marker: Marker | None = None, *, tag: int | 
     if marker is not None:
         middle = np.stack([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5]])
         corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        points = cells.piece_points[piece]
         for position in (corners[side], middle[side], corners[(side + 1) % 4]):
-            chosen &= _marked(marker, _points_at(cells, piece, position))
+            chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
     return np.unique(_trace_rows(cells, piece[chosen], side[chosen]).indices).astype(np.int32)
 
 
@@ -194,19 +195,10 @@ def _marked(marker: Marker, points: Floats) -> Bools:
 def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
     """Return the half-edges of the control mesh whose edge carries the tag."""
     mesh = V.mesh
-    edges = np.array([edge for edge, t in mesh.edge_tags.items() if t == tag], dtype=np.int64).reshape(-1, 2)
-    n = mesh.num_vertices
-    following = np.arange(1, mesh.face_vertices.size + 1)
-    following[mesh.face_offsets[1:] - 1] = mesh.face_offsets[:-1]
-    ends = np.sort(np.stack([mesh.face_vertices, mesh.face_vertices[following]], axis=1).astype(np.int64), axis=1)
-    return np.isin(ends[:, 0] * n + ends[:, 1], edges[:, 0] * n + edges[:, 1])
-
-
-def _points_at(cells: Cells, piece: Ints, uv: Floats) -> Floats:
-    basis = element.bspline_values(uv)
-    return np.einsum(
-        "nj,ni,njic->nc", basis[:, 1], basis[:, 0], cells.piece_points[piece].reshape(piece.size, 4, 4, -1)
-    )
+    pairs = [edge for edge, t in mesh.edge_tags.items() if t == tag]
+    tagged = np.zeros(mesh.num_edges, dtype=bool)
+    tagged[mesh.edge_indices(np.array(pairs, dtype=np.int32).reshape(-1, 2))] = True
+    return tagged[mesh.face_edges]
 
 
 def _trace_rows(cells: Cells, piece: Ints, side: Ints) -> sp.csr_array:
