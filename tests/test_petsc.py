@@ -341,7 +341,7 @@ def test_small_systems_are_factorised() -> None:
 
 
 def test_large_systems_are_iterated(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(petsc, "LARGEST_DIRECT", 10)
+    monkeypatch.setattr(petsc.linear, "LARGEST_DIRECT", 10)
     V = torus()
     u, v, _ = arguments(V)
     for a, kind in ((laplace(V) + u * v * dx, "cg"), (laplace(V) + (u + u.dx(0)) * v * dx, "gmres")):

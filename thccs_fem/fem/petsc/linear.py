@@ -1,40 +1,26 @@
-"""PETSc: matrices and vectors of forms, and linear problems solved by any of its solvers.
-
-Matrices use the memory of the CSR arrays that assembly fills, without a copy.
-"""
+"""Linear problems solved by any KSP of PETSc."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property, singledispatch
+from functools import cached_property
 from typing import Any
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 import ufl
-from thccs_fem.fem import assembly
 from thccs_fem.fem.bcs import DirichletBC
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.linear import (
-    Constants,
-    LinearSystem,
-    check_regular,
-    check_residual,
-    constrain,
-    constraints,
-    is_symmetric,
-)
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.linear import Constants, LinearSystem, check_regular, check_residual, is_symmetric
+from thccs_fem.fem.petsc.matrices import changed, comm_of, new_mat, new_vec
 
-__all__ = ["LinearProblem", "apply_lifting", "assemble_matrix", "assemble_vector", "set_bc"]
+__all__ = ["LinearProblem"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -50,140 +36,6 @@ ADVICE = {
     "DIVERGED_NANORINF": "values are not finite: see that coefficients and data are",
 }
 DIRECT = {"ksp_type": "preonly", "pc_type": "lu", "pc_factor_mat_solver_type": "mumps"}
-
-
-# ---- Matrices and vectors --------------------------------------------------------------------------------------------
-
-
-@singledispatch
-def assemble_matrix(form: Any, *args: Any, **kwargs: Any) -> PETSc.Mat:
-    """Return the matrix of a form, ``assemble_matrix(a, bcs)``, or fill it anew, ``assemble_matrix(A, a, bcs)``.
-
-    Rows and columns of dofs with a condition are those of the identity. The matrix is ready for use.
-
-    Args:
-        form: Compiled bilinear form; or the matrix to be filled anew, then the form.
-        *args: The form, if the matrix came first, and conditions.
-        **kwargs: Conditions by name, `bcs`.
-
-    Raises:
-        TypeError: The first argument is neither form nor matrix.
-        ValueError: The form has not two arguments; conditions are on another space than they; or the matrix to be
-            filled was not assembled here, or from a form with other spaces.
-    """
-    raise TypeError(f"assemble_matrix needs a form from fem.form, or a Mat and a form, got {type(form).__name__}")
-
-
-@assemble_matrix.register
-def _(form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
-    A = assembly.assemble_matrix(form)
-    _constrain(A, form, bcs)
-    return _new_mat(A, form.spaces)
-
-
-@assemble_matrix.register
-def _(A: PETSc.Mat, form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
-    values = A.getAttr("values")
-    if not isinstance(values, sp.csr_array):
-        raise ValueError("the matrix to be filled does not use memory of ours: make it with assemble_matrix(form)")
-    assembly.assemble_matrix(values, form)
-    _constrain(values, form, bcs)
-    _changed(A)
-    return A
-
-
-def assemble_vector(form: Form, /) -> PETSc.Vec:
-    """Assemble the vector of a form with a test function.
-
-    Raises:
-        ValueError: The form has not one argument.
-    """
-    return _new_vec(assembly.assemble_vector(form), _comm(form.spaces[0]))
-
-
-def apply_lifting(
-    b: PETSc.Vec,
-    a: Sequence[Form],
-    bcs: Sequence[Sequence[DirichletBC]],
-    x0: Sequence[PETSc.Vec] = (),
-    alpha: float = 1.0,
-) -> PETSc.Vec:
-    """Subtract from b what prescribed values contribute to the equations, alpha A (g - x0).
-
-    Each A is assembled for this, without conditions. Entries of prescribed dofs are left to `set_bc`.
-
-    Args:
-        b: The vector, changed in place.
-        a: Bilinear forms whose test space is that of b.
-        bcs: For each form the conditions on its trial space.
-        x0: For each form a vector whose values are subtracted from the prescribed ones; none: zero.
-        alpha: Factor.
-
-    Raises:
-        ValueError: A condition is on another space, or there are not as many of one thing as of the other.
-    """
-    states = [x.array_r for x in x0] or [np.zeros(form.spaces[1].num_dofs) for form in a]
-    for form, conditions, state in zip(a, bcs, states, strict=True):
-        dofs, values = constraints(conditions, form.spaces[1])
-        if dofs.size:
-            g = np.zeros(state.size)
-            g[dofs] = values - state[dofs]
-            b.array_w[:] -= alpha * (assembly.assemble_matrix(form) @ g)
-    return b
-
-
-def set_bc(b: PETSc.Vec, bcs: Sequence[DirichletBC], x0: PETSc.Vec | None = None, alpha: float = 1.0) -> None:
-    """Set the entries of prescribed dofs to alpha (g - x0).
-
-    Args:
-        b: The vector, changed in place.
-        bcs: Conditions; where two prescribe the same dof, the later one holds.
-        x0: A vector whose values are subtracted from the prescribed ones; None: zero.
-        alpha: Factor.
-    """
-    if bcs:
-        dofs, values = constraints(bcs, bcs[0].function_space)
-        b.array_w[dofs] = alpha * (values if x0 is None else values - x0.array_r[dofs])
-
-
-def _constrain(A: sp.csr_array, form: Form, bcs: Sequence[DirichletBC]) -> None:
-    if bcs:
-        test, trial = form.spaces
-        if test != trial:
-            raise ValueError(f"conditions need test and trial functions in one space, not in {test} and {trial}")
-        constrain(A, constraints(bcs, trial)[0])
-
-
-def _comm(V: FunctionSpace) -> Any:  # petsc4py takes mpi4py's, but its stubs say otherwise
-    return MPI.COMM_SELF if V.mesh.comm is None else V.mesh.comm
-
-
-def _new_vec(array: Any, comm: Any) -> PETSc.Vec:
-    """Return a vector that uses the memory of an array."""
-    return PETSc.Vec().createWithArray(array, comm=comm)
-
-
-def _new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
-    """Return a matrix that uses the memory of A."""
-    if np.dtype(PETSc.ScalarType) != np.float64:
-        raise TypeError(
-            f"PETSc was built for {np.dtype(PETSc.ScalarType)}; forms here are real, double precision: use such a build"
-        )
-    test, trial = spaces
-    csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
-    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=_comm(test))
-    mat.setBlockSizes(test.block_size, trial.block_size)
-    mat.setAttr("values", A)
-    return mat
-
-
-def _changed(mat: PETSc.Mat) -> None:
-    """Tell PETSc that values were written to the memory of a matrix."""
-    mat.assemble()
-    mat.stateIncrease()
-
-
-# ---- Linear problems -------------------------------------------------------------------------------------------------
 
 
 class LinearProblem:
@@ -231,7 +83,7 @@ class LinearProblem:
         self.bcs = bcs
         self._options = {name.removeprefix("-"): value for name, value in (petsc_options or {}).items()}
         self._unused = set(self._options)
-        self._comm = _comm(self.u.function_space)
+        self._comm = comm_of(self.u.function_space)
         self._solver = PETSc.KSP().create(self._comm)
         self._solver.setOptionsPrefix(petsc_options_prefix)
         self._solver.setTolerances(rtol=TOLERANCE)
@@ -243,12 +95,12 @@ class LinearProblem:
     @cached_property
     def A(self) -> PETSc.Mat:
         """The matrix of the last `solve`, or assembled now; rows of prescribed dofs are the identity's."""
-        return _new_mat(self._system.A, self._system.a.spaces)
+        return new_mat(self._system.A, self._system.a.spaces)
 
     @cached_property
     def b(self) -> PETSc.Vec:
         """The right-hand side of the last `solve`, prescribed values included."""
-        return _new_vec(self._system.b, self._comm)
+        return new_vec(self._system.b, self._comm)
 
     @property
     def u(self) -> Function:
@@ -270,9 +122,9 @@ class LinearProblem:
         """
         self._system.bcs = self.bcs
         self._system.assemble()
-        _changed(self.A)
+        changed(self.A)
         self.b.stateIncrease()
-        x = _new_vec(self.u.x.array, self._comm)
+        x = new_vec(self.u.x.array, self._comm)
         with self._options_in_place():
             if not self._is_chosen:
                 self._choose()
@@ -325,7 +177,7 @@ class LinearProblem:
         self.A.setNullSpace(_null_space(constants, self._comm))
         self.A.setTransposeNullSpace(_null_space(constants, self._comm))
         if constants is not None and self._factorises:
-            to_factorise = _new_mat(self._system.regular(), self._system.a.spaces)
+            to_factorise = new_mat(self._system.regular(), self._system.a.spaces)
         self._solver.setOperators(self.A, to_factorise)
 
     def _check(self, x: Floats) -> None:
@@ -351,11 +203,11 @@ def _null_space(constants: Constants | None, comm: Any) -> PETSc.NullSpace:
     if constants is None:
         return PETSc.NullSpace()  # takes away what was set before
     vectors = [constants.spread(unit) for unit in np.eye(constants.num_constants)]
-    return PETSc.NullSpace().create(vectors=[_new_vec(v / np.linalg.norm(v), comm) for v in vectors], comm=comm)
+    return PETSc.NullSpace().create(vectors=[new_vec(v / np.linalg.norm(v), comm) for v in vectors], comm=comm)
 
 
 def _solved(factors: PETSc.Mat, b: Floats) -> Floats:
     """Return the solution for a right-hand side, from the factors of a matrix."""
     x = np.zeros_like(b)
-    factors.solve(_new_vec(b, factors.comm), _new_vec(x, factors.comm))
+    factors.solve(new_vec(b, factors.comm), new_vec(x, factors.comm))
     return x

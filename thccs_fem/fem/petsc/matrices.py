@@ -1,0 +1,153 @@
+"""Matrices and vectors of forms in PETSc. They use the memory of the arrays that assembly fills, without a copy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import singledispatch
+from typing import Any
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem.fem import assembly
+from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.forms import Form
+from thccs_fem.fem.linear import constrain, constraints
+from thccs_fem.fem.space import FunctionSpace
+
+__all__ = ["apply_lifting", "assemble_matrix", "assemble_vector", "changed", "comm_of", "new_mat", "new_vec", "set_bc"]
+
+Floats = npt.NDArray[np.float64]
+
+
+@singledispatch
+def assemble_matrix(form: Any, *args: Any, **kwargs: Any) -> PETSc.Mat:
+    """Return the matrix of a form, ``assemble_matrix(a, bcs)``, or fill it anew, ``assemble_matrix(A, a, bcs)``.
+
+    Rows and columns of dofs with a condition are those of the identity. The matrix is ready for use.
+
+    Args:
+        form: Compiled bilinear form; or the matrix to be filled anew, then the form.
+        *args: The form, if the matrix came first, and conditions.
+        **kwargs: Conditions by name, `bcs`.
+
+    Raises:
+        TypeError: The first argument is neither form nor matrix.
+        ValueError: The form has not two arguments; conditions are on another space than they; or the matrix to be
+            filled was not assembled here, or from a form with other spaces.
+    """
+    raise TypeError(f"assemble_matrix needs a form from fem.form, or a Mat and a form, got {type(form).__name__}")
+
+
+@assemble_matrix.register
+def _(form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
+    A = assembly.assemble_matrix(form)
+    _constrain(A, form, bcs)
+    return new_mat(A, form.spaces)
+
+
+@assemble_matrix.register
+def _(A: PETSc.Mat, form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
+    values = A.getAttr("values")
+    if not isinstance(values, sp.csr_array):
+        raise ValueError("the matrix to be filled does not use memory of ours: make it with assemble_matrix(form)")
+    assembly.assemble_matrix(values, form)
+    _constrain(values, form, bcs)
+    changed(A)
+    return A
+
+
+def assemble_vector(form: Form, /) -> PETSc.Vec:
+    """Assemble the vector of a form with a test function.
+
+    Raises:
+        ValueError: The form has not one argument.
+    """
+    return new_vec(assembly.assemble_vector(form), comm_of(form.spaces[0]))
+
+
+def apply_lifting(
+    b: PETSc.Vec,
+    a: Sequence[Form],
+    bcs: Sequence[Sequence[DirichletBC]],
+    x0: Sequence[PETSc.Vec] = (),
+    alpha: float = 1.0,
+) -> PETSc.Vec:
+    """Subtract from b what prescribed values contribute to the equations, alpha A (g - x0).
+
+    Each A is assembled for this, without conditions. Entries of prescribed dofs are left to `set_bc`.
+
+    Args:
+        b: The vector, changed in place.
+        a: Bilinear forms whose test space is that of b.
+        bcs: For each form the conditions on its trial space.
+        x0: For each form a vector whose values are subtracted from the prescribed ones; none: zero.
+        alpha: Factor.
+
+    Raises:
+        ValueError: A condition is on another space, or there are not as many of one thing as of the other.
+    """
+    states = [x.array_r for x in x0] or [np.zeros(form.spaces[1].num_dofs) for form in a]
+    for form, conditions, state in zip(a, bcs, states, strict=True):
+        dofs, values = constraints(conditions, form.spaces[1])
+        if dofs.size:
+            g = np.zeros(state.size)
+            g[dofs] = values - state[dofs]
+            b.array_w[:] -= alpha * (assembly.assemble_matrix(form) @ g)
+    return b
+
+
+def set_bc(b: PETSc.Vec, bcs: Sequence[DirichletBC], x0: PETSc.Vec | None = None, alpha: float = 1.0) -> None:
+    """Set the entries of prescribed dofs to alpha (g - x0).
+
+    Args:
+        b: The vector, changed in place.
+        bcs: Conditions; where two prescribe the same dof, the later one holds.
+        x0: A vector whose values are subtracted from the prescribed ones; None: zero.
+        alpha: Factor.
+    """
+    if bcs:
+        dofs, values = constraints(bcs, bcs[0].function_space)
+        b.array_w[dofs] = alpha * (values if x0 is None else values - x0.array_r[dofs])
+
+
+def _constrain(A: sp.csr_array, form: Form, bcs: Sequence[DirichletBC]) -> None:
+    if bcs:
+        test, trial = form.spaces
+        if test != trial:
+            raise ValueError(f"conditions need test and trial functions in one space, not in {test} and {trial}")
+        constrain(A, constraints(bcs, trial)[0])
+
+
+def comm_of(V: FunctionSpace) -> Any:  # petsc4py takes mpi4py's, but its stubs say otherwise
+    """Return the communicator of the mesh; without one that of this process alone."""
+    return MPI.COMM_SELF if V.mesh.comm is None else V.mesh.comm
+
+
+def new_vec(array: Any, comm: Any) -> PETSc.Vec:
+    """Return a vector that uses the memory of an array."""
+    return PETSc.Vec().createWithArray(array, comm=comm)
+
+
+def new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
+    """Return a matrix that uses the memory of A."""
+    if np.dtype(PETSc.ScalarType) != np.float64:
+        raise TypeError(
+            f"PETSc was built for {np.dtype(PETSc.ScalarType)}; forms here are real, double precision: use such a build"
+        )
+    test, trial = spaces
+    csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
+    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=comm_of(test))
+    mat.setBlockSizes(test.block_size, trial.block_size)
+    mat.setAttr("values", A)
+    return mat
+
+
+def changed(mat: PETSc.Mat) -> None:
+    """Tell PETSc that values were written to the memory of a matrix."""
+    mat.assemble()
+    mat.stateIncrease()
