@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -223,6 +224,80 @@ def test_marks_are_numbers_of_functions(marked: npt.ArrayLike) -> None:
         adapt.refine(space("grid"), marked)
 
 
+# ---- Coarsening
+
+
+@each_space
+def test_coarsening_undoes_refinement(name: str) -> None:
+    V = space(name)
+    fine = adapt.refine(V, [0, 5])
+    before = set(zip(V.cells.level.tolist(), keys(V), strict=True))
+    new = np.array([cell not in before for cell in zip(fine.cells.level.tolist(), keys(fine), strict=True)])
+    assert adapt.coarsen(fine, new) == V
+    assert adapt.coarsen(fine, np.flatnonzero(new)[::-1]) == V
+    assert adapt.coarsen(fine, []) is fine
+
+
+def test_coarsening_keeps_the_kind_of_space() -> None:
+    fine = adapt.refine(fem.FunctionSpace(space("grid").hierarchy, (2,)), [0])
+    coarse = adapt.coarsen(fine, np.ones(fine.num_cells, dtype=bool))
+    assert coarse.value_shape == (2,)
+    assert fine.is_refinement_of(coarse)
+    assert coarse.num_levels == 1
+    assert adapt.coarsen(coarse, np.ones(coarse.num_cells, dtype=bool)) is coarse
+
+
+def test_remeshing_refines_here_and_coarsens_there() -> None:
+    V = fem.functionspace(generators.torus((16, 8)), ("THCCS", 3))
+    there = adapt.refine(V, [0])
+    here = np.flatnonzero(there.hierarchy.dof_functions(0) == 68)  # far from function 0
+    everything = np.ones(there.num_cells, dtype=bool)
+    assert adapt.remesh(there, here, everything) == adapt.refine(V, [68])
+    assert adapt.remesh(there, here, []) == adapt.refine(there, here)
+    assert adapt.remesh(there, [], everything) == V
+    assert adapt.remesh(there, [], []) is there
+
+
+@pytest.mark.parametrize(
+    ("cells", "error", "message"),
+    [
+        ([-1], ValueError, "cells run from 0 to 11; got -1 to -1"),
+        ([3, 12], ValueError, "cells run from 0 to 11; got 3 to 12"),
+        (np.ones(11, dtype=bool), ValueError, r"marks have shape \(11,\); there must be one for each of the 12 cells"),
+        ([0.5], TypeError, "marked cells must be integers or bools"),
+    ],
+)
+def test_cells_to_coarsen_are_checked(cells: npt.ArrayLike, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        adapt.coarsen(space("grid"), cells)
+    with pytest.raises(error, match=message):
+        adapt.remesh(space("grid"), [0], cells)
+
+
+@given(some_space, seeds, st.sampled_from([0.0, 0.125, 0.5]))
+def test_the_most_cells_that_carry_little_are_marked_for_coarsening(name: str, seed: int, theta: float) -> None:
+    eta, _ = indicators(name, seed)
+    marked = adapt.mark_coarsening(space(name), eta, theta)
+    allowed, carried, count = theta * sum(eta**2), 0.0, 0
+    for square in sorted((eta**2).tolist()):
+        carried += square
+        count += carried <= allowed
+    assert marked.size == count
+    assert sum(eta[marked] ** 2) <= allowed
+    rest = np.delete(eta, marked)
+    assert not marked.size or eta[marked].max() <= rest.min(initial=np.inf)
+    assert (np.diff(marked) > 0).all()
+
+
+def test_marking_for_coarsening_checks_its_arguments() -> None:
+    V = space("grid")
+    for theta in (-0.1, 1.0):
+        with pytest.raises(ValueError, match=rf"theta is {theta}; it must lie in \[0, 1\)"):
+            adapt.mark_coarsening(V, np.ones(12), theta)
+    with pytest.raises(ValueError, match="it needs one value for each of the 12 cells"):
+        adapt.mark_coarsening(V, np.ones(11))
+
+
 # ---- Transfer
 
 
@@ -266,14 +341,26 @@ def test_transfer_to_the_same_space_copies() -> None:
     assert u.x.array.any()
 
 
-def test_transfer_to_a_space_that_is_no_refinement_is_refused() -> None:
+def test_transfer_to_an_unrelated_space_is_refused() -> None:
     V = space("grid")
-    with pytest.raises(ValueError, match="spaces are not nested"):
-        adapt.transfer(with_random_values(adapt.refine(V, [0])), V)
-    with pytest.raises(ValueError, match="spaces are not nested"):
+    with pytest.raises(ValueError, match="the hierarchies have no common refinement"):
         adapt.transfer(with_random_values(V), space("grid, crease"))
     with pytest.raises(ValueError, match=r"values of shape \(\) cannot be carried to shape \(2,\)"):
         adapt.transfer(with_random_values(V), fem.FunctionSpace(V.hierarchy, (2,)))
+    with pytest.raises(ValueError, match='projection is \'L1\'; it must be "L2" or "H1"'):
+        adapt.transfer(with_random_values(V), V, projection="L1")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("projection", ["L2", "H1"])
+def test_transfer_to_a_coarser_space_projects(projection: Literal["L2", "H1"]) -> None:
+    """What came from the coarser space comes back, and zero is zero; test_coarsening.py has the rest."""
+    V = space("refined cube")
+    fine = randomly_refined(V, times=2, seed=1)
+    u = with_random_values(V)
+    back = adapt.transfer(adapt.transfer(u, fine), V, projection=projection)
+    assert (back.function_space, back.name) == (V, "v")
+    np.testing.assert_allclose(back.x.array, u.x.array, atol=1e-11)  # scaled condition numbers up to 10^4
+    assert not adapt.transfer(fem.Function(fine), V, projection=projection).x.array.any()
 
 
 # ---- The loop

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 import basix.ufl
 import ufl
 from thccs_fem import element, fem, generators, jit
-from thccs_fem.extraction import Batch
-from thccs_fem.fem import assembly
+from thccs_fem.extraction import Batch, Cells
+from thccs_fem.fem import sparsity
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.mesh import ControlMesh
@@ -84,7 +84,7 @@ def slowly(form: Form) -> Floats:
     return total
 
 
-def pieces(cells: assembly.Cells) -> list[tuple[int, npt.NDArray[np.int32], Floats, Floats]]:
+def pieces(cells: Cells) -> list[tuple[int, npt.NDArray[np.int32], Floats, Floats]]:
     """Return cell, dofs, operator and control points of each piece, without padding."""
     found = []
     for batch in cells.batches:
@@ -161,6 +161,7 @@ class RandomCells:
     tag: npt.NDArray[np.int32]
     points: Floats
     batches: tuple[Batch, ...]
+    cell_dofs = Cells.cell_dofs
 
 
 def random_cells(num_dofs: int, width: int, num_cells: int = 7, seed: int = 0) -> RandomCells:
@@ -210,7 +211,7 @@ def test_rows_too_long_for_8_bit_positions() -> None:
         form = dataclasses.replace(form, cells=random_cells(V.num_dofs, width))
         expected = slowly(form)
         np.testing.assert_allclose(fast(form), expected, atol=1e-13 * np.abs(expected).max())
-        assert assembly._pattern(form.cells).positions.dtype == dtype
+        assert sparsity.pattern(form.cells, False).positions.dtype == dtype
 
 
 # ---- Closed forms
@@ -421,8 +422,8 @@ def test_threads_do_not_disturb_each_other(V: FunctionSpace) -> None:
 
 def test_pattern_is_found_once_and_goes_with_the_cells() -> None:
     V = ZOO["torus"]()
-    assert assembly._pattern(V.cells) is assembly._pattern(V.cells)
-    cells, pattern = weakref.ref(V.cells), weakref.ref(assembly._pattern(V.cells))
+    assert sparsity.pattern(V.cells, False) is sparsity.pattern(V.cells, False)
+    cells, pattern = weakref.ref(V.cells), weakref.ref(sparsity.pattern(V.cells, False))
     del V
     gc.collect()
     assert cells() is None
@@ -469,16 +470,88 @@ def test_too_many_entries_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     scalar = fem.form(ufl.TrialFunction(V) * ufl.TestFunction(V) * dx)
     blocked = fem.form(inner(ufl.TrialFunction(W), ufl.TestFunction(W)) * dx)
     entries = fem.assemble_matrix(scalar).nnz
-    monkeypatch.setattr(assembly, "LARGEST_INT", 2 * entries)
+    monkeypatch.setattr(sparsity, "LARGEST_INT", 2 * entries)
     with pytest.raises(ValueError, match=f"the matrix would have {9 * entries} entries, more than the {2 * entries}"):
         fem.assemble_matrix(blocked)
-    monkeypatch.setattr(assembly, "LARGEST_INT", entries - 1)
+    monkeypatch.setattr(sparsity, "LARGEST_INT", entries - 1)
     with pytest.raises(ValueError, match=f"{entries} entries of the matrix are more than the {entries - 1}"):
-        assembly._new_pattern(V.cells)
+        sparsity.pattern(dataclasses.replace(V.cells), False)
 
 
 def test_longest_row_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     V = ZOO["torus"]()
-    monkeypatch.setattr(assembly, "LONGEST_ROW", 36)  # 48 dofs, of which each reaches 7 x 6
+    monkeypatch.setattr(sparsity, "LONGEST_ROW", 36)  # 48 dofs, of which each reaches 7 x 6
     with pytest.raises(ValueError, match="a dof shares cells with 42 others, more than 36: split the pole"):
-        assembly._new_pattern(V.cells)
+        sparsity.pattern(dataclasses.replace(V.cells), False)
+
+
+# ---- Facets
+
+
+def test_matrices_with_facets_have_a_pattern_of_their_own(V: FunctionSpace) -> None:
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    forms = [u * v * dx, u * v * dx + u * v * ufl.ds, u * v * dx + ufl.jump(grad(u))[0] * ufl.avg(v) * ufl.dS]
+    inside, around, across = (fem.assemble_matrix(fem.form(form)) for form in forms)
+    np.testing.assert_array_equal(inside.indices, around.indices)
+    assert across.nnz > inside.nnz
+    for A, form in zip((inside, around, across), forms, strict=True):
+        expected = A.copy()
+        A.data[:] = np.nan
+        assert fem.assemble_matrix(A, fem.form(form)) is A
+        np.testing.assert_array_equal(A.data, expected.data)
+    with pytest.raises(ValueError, match="give a matrix that was assembled from a form with the same spaces"):
+        fem.assemble_matrix(inside, fem.form(forms[2]))
+
+
+def test_facets_of_the_finest_cells_with_coarser_arguments() -> None:
+    """On the coarse space, forms with functions on finer cells: the facets are those of the finer ones."""
+    V = randomly_refined(fem.functionspace(generators.wheel(5, 3), ("THCCS", 3)), 1)
+    fine = randomly_refined(V, 2)
+    u, v, n = ufl.TrialFunction(V), ufl.TestFunction(V), ufl.FacetNormal(V.mesh)
+    U, Z = ufl.TrialFunction(fine), ufl.TestFunction(fine)
+    f = fem.Function(fine)
+    f.x.array = np.random.default_rng(0).random(fine.num_dofs)
+
+    def form(u: ufl.Argument, v: ufl.Argument) -> Form:
+        kinks = ufl.jump(f * grad(u), n) * ufl.avg(ufl.dot(grad(v), grad(f)))
+        return fem.form(f * u * v * ufl.ds + kinks * ufl.dS)
+
+    P = fine.prolongation(V)
+    A, B = fem.assemble_matrix(form(u, v)), P.T @ fem.assemble_matrix(form(U, Z)) @ P
+    np.testing.assert_allclose(A.toarray(), B.toarray(), atol=1e-13 * abs(A.toarray()).max())
+    again = A.copy()
+    fem.assemble_matrix(again, form(u, v))
+    assert (again != A).nnz == 0
+
+
+def test_derivatives_of_integrals_over_facets() -> None:
+    """Of a functional with ds and dS, against central differences, and lhs, rhs, action and adjoint."""
+    V = randomly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3)), 1)
+    n, k, x = ufl.FacetNormal(V.mesh), fem.Constant(V.mesh, [[2.0, 0.5], [-0.5, 1.0]]), ufl.SpatialCoordinate(V.mesh)
+    h, w, d = fem.cell_sizes(V), fem.Function(V), fem.Function(V)
+    rng = np.random.default_rng(0)
+    w.x.array, d.x.array = rng.random(V.num_dofs), rng.random(V.num_dofs)
+    flux = ufl.dot(k, grad(w))
+    J = w**4 * ufl.ds + ufl.avg(h) * ufl.jump(h * flux, n) ** 2 * ufl.dS + x[0] * w**2 * dx
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    F = ufl.derivative(J, w, v)
+    b, A = fem.assemble_vector(fem.form(F)), fem.assemble_matrix(fem.form(ufl.derivative(F, w, u)))
+    compiled, values, eps = [fem.form(form) for form in (J, F)], w.x.array.copy(), 1e-4
+    ends = []
+    for sign in (1.0, -1.0):
+        w.x.array = values + sign * eps * d.x.array
+        ends.append((fem.assemble_scalar(compiled[0]), fem.assemble_vector(compiled[1])))
+    w.x.array = values
+    assert (ends[0][0] - ends[1][0]) / (2 * eps) == pytest.approx(b @ d.x.array, rel=1e-6)
+    slope = (ends[0][1] - ends[1][1]) / (2 * eps)
+    np.testing.assert_allclose(slope, A @ d.x.array, atol=1e-6 * abs(slope).max())  # eps^2
+    a = u * ufl.dot(grad(v), n) * ufl.ds + ufl.jump(h * grad(u), n) * ufl.avg(v) * ufl.dS
+    M, T = fem.assemble_matrix(fem.form(a)), fem.assemble_matrix(fem.form(ufl.adjoint(a)))
+    np.testing.assert_allclose(M.toarray(), T.toarray().T, atol=1e-14 * abs(M.toarray()).max())
+    np.testing.assert_allclose(fem.assemble_vector(fem.form(ufl.action(a, d))), M @ d.x.array, atol=1e-12)
+    load = w * v * ufl.ds
+    left, right = ufl.system(a - load)
+    assert (fem.assemble_matrix(fem.form(left)) != M).nnz == 0
+    np.testing.assert_array_equal(fem.assemble_vector(fem.form(right)), fem.assemble_vector(fem.form(load)))
+    replaced = fem.form(ufl.replace(load, {w: d}))
+    np.testing.assert_array_equal(fem.assemble_vector(replaced), fem.assemble_vector(fem.form(d * v * ufl.ds)))

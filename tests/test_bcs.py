@@ -11,6 +11,7 @@ from zoo import ZOO
 
 import ufl
 from thccs_fem import adapt, fem, generators, limit
+from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.mesh import ControlMesh
 from ufl import as_vector, sin, sqrt
@@ -401,6 +402,141 @@ def test_conditions_hold_at_points_of_the_rim() -> None:
         uv.append([[0.3, 0.0], [1.0, 0.3], [0.7, 1.0], [0.0, 0.7]][k])
     X = limit.evaluate(V.mesh, faces, uv)[0]
     np.testing.assert_allclose(u.eval(faces, uv), X[:, 0] - X[:, 2], atol=1e-9)
+
+
+# ---- Slopes
+
+
+def slopes_on_the_rim(u: fem.Function) -> tuple[Floats, Floats]:
+    """Values, and derivatives along the inner conormal, at points of all boundary edges, by differences of values."""
+    V = u.function_space
+    piece, side, _ = V.cells.boundary_pieces
+    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[side]
+    along = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[side]
+    inward = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])[side]
+    at = corner + 0.3 * along
+
+    def derivative(local: Floats, direction: Floats) -> Floats:
+        values = [evaluate_pieces(local, piece, at + step * direction) for step in (0.0, 0.25, 0.5, 0.75)]
+        return (-11 * values[0] + 18 * values[1] - 9 * values[2] + 2 * values[3]) / 1.5  # exact for cubics
+
+    (xs, us), (xt, ut) = (
+        [derivative(local, direction) for local in (V.cells.piece_points, u.local_coefficients())]
+        for direction in (along, inward)
+    )
+    shear = (xt * xs).sum(axis=1) / (xs**2).sum(axis=1)
+    width = np.linalg.norm(xt - shear[:, None] * xs, axis=1)
+    return evaluate_pieces(u.local_coefficients(), piece, at)[:, 0], (ut[:, 0] - shear * us[:, 0]) / width
+
+
+@pytest.mark.parametrize("times", [0, 2])
+@pytest.mark.parametrize("boundary", ["clamped", "crease"])
+@pytest.mark.parametrize("name", WITH_RIM)
+def test_all_other_functions_have_no_value_and_no_slope(name: str, boundary: str, times: int) -> None:
+    V = space(name, boundary, times)
+    found = fem.boundary_dofs(V, slope=True)
+    assert set(fem.boundary_dofs(V)) <= set(found)
+    value, slope = slopes_on_the_rim(with_random_values(V, others(V, found)))
+    np.testing.assert_allclose(value, 0.0, atol=1e-12)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-11)  # differences of values of size 2, over cells of size 0.1
+
+
+@pytest.mark.parametrize("times", [0, 2])
+def test_each_of_these_functions_has_a_value_or_a_slope(times: int) -> None:
+    for name in ("grid", "wheel6", "l_domain_tagged", "rim_of_four"):
+        V = space(name, times=times)
+        for dof in fem.boundary_dofs(V, slope=True):
+            value, slope = slopes_on_the_rim(with_random_values(V, [dof]))
+            assert max(np.abs(value).max(), np.abs(slope).max()) > 1e-4, dof
+
+
+def test_numbers_of_slope_dofs_are_those_of_splines() -> None:
+    V = unit_square()
+    assert fem.boundary_dofs(V, slope=True).size == 4 * 6 + 4 * 4  # the two outermost rings of 7 x 7
+    assert fem.boundary_dofs(V, lambda x: np.isclose(x[1], 0.0), slope=True).size == 2 * 7
+
+
+@pytest.mark.parametrize("times", [0, 2])
+@pytest.mark.parametrize("boundary", ["clamped", "crease"])
+@pytest.mark.parametrize("name", [name for name in WITH_RIM if name != "pole"])  # the slowest
+def test_value_and_slope_determine_what_is_in_the_space(name: str, boundary: str, times: int) -> None:
+    # Random coefficients: nothing is smooth here that could help.
+    V = space(name, boundary, times)
+    u = with_random_values(V, np.arange(V.num_functions))
+    dofs = fem.boundary_dofs(V, slope=True)
+    bc = fem.dirichletbc(u, dofs, V, slope=True)
+    np.testing.assert_array_equal(bc.dofs, dofs)
+    np.testing.assert_allclose(bc.values, u.x.array[dofs], atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("times", [0, 2])
+def test_slopes_on_a_part_of_the_boundary(times: int) -> None:
+    V = unit_square(times=times)
+    dofs = fem.boundary_dofs(V, lambda x: np.isclose(x[0], 0.0), slope=True)
+    x = ufl.SpatialCoordinate(V.mesh)
+    u = fem.Function(V)
+    u.x.array[dofs] = fem.dirichletbc(1.0 + 2.0 * x[0], dofs, V, slope=True).values
+    value, slope = slopes_on_the_rim(u)
+    on_left = slopes_on_the_rim(fem.project(x[0], V))[0] < 1e-9
+    assert np.count_nonzero(on_left) >= 4
+    np.testing.assert_allclose(value[on_left], 1.0, atol=TOLERANCE)
+    np.testing.assert_allclose(slope[on_left], 2.0, atol=10 * TOLERANCE)  # cells of width 1/16 at least
+
+
+def test_values_and_slopes_are_fitted_at_full_order() -> None:
+    errors = []
+    for n in (4, 8):
+        msh = generators.disc(n)
+        V = fem.functionspace(msh, SCALAR)
+        x = ufl.SpatialCoordinate(msh)
+        u, dofs = fem.Function(V), fem.boundary_dofs(V, slope=True)
+        exact = sin(2 * x[0] + 1) * ufl.cos(1.5 * x[1])
+        u.x.array[dofs] = fem.dirichletbc(exact, dofs, V, slope=True).values
+        value, slope = slopes_on_the_rim(u)
+        # The exact ones, from the position and the conormal: both are values of functions of the space.
+        X, N = np.transpose([slopes_on_the_rim(fem.project(x[i], V)) for i in range(2)], (1, 2, 0))
+        a, b = 2 * X[:, 0] + 1, 1.5 * X[:, 1]
+        gradient = np.stack([2 * np.cos(a) * np.cos(b), -1.5 * np.sin(a) * np.sin(b)], axis=1)
+        errors.append([np.abs(value - np.sin(a) * np.cos(b)).max(), np.abs(slope - (gradient * N).sum(axis=1)).max()])
+    rates = np.log2(np.divide(*errors))
+    assert ((3.0 < rates) & (rates < 6.0)).all(), rates  # 4 for values; for slopes 3, or 4 where they superconverge
+    assert (np.array(errors[1]) < [1e-4, 1e-3]).all(), errors
+
+
+def test_zero_value_and_slope_are_zero_coefficients() -> None:
+    # (1 - x^2)^2 (1 - y^2)^2 and both its derivatives vanish on the rim; inside it is not small, nor in the space.
+    V = fem.functionspace(generators.rectangle((5, 5)), SCALAR)
+    x = ufl.SpatialCoordinate(V.mesh)
+    lower, upper = V.mesh.vertices.min(axis=0), V.mesh.vertices.max(axis=0)
+    bump = np.prod([16 * ((x[i] - lower[i]) * (upper[i] - x[i])) ** 2 / (upper[i] - lower[i]) ** 4 for i in (0, 1)])
+    dofs = fem.boundary_dofs(V, slope=True)
+    np.testing.assert_allclose(fem.dirichletbc(bump, dofs, V, slope=True).values, 0.0, atol=TOLERANCE)
+    assert np.abs(fem.dirichletbc(bump, dofs, V).values).max() > 1e-4  # fitted on the cells, it is merely near
+
+
+def test_slopes_of_vectors() -> None:
+    scalar = space("wheel5")
+    V = FunctionSpace(scalar.hierarchy, (2,))
+    x = ufl.SpatialCoordinate(V.mesh)
+    dofs = fem.boundary_dofs(V, slope=True)
+    both = fem.dirichletbc(as_vector([sin(x[0]), x[1] * x[2]]), dofs, V, slope=True).values.reshape(-1, 2)
+    for c, g in enumerate((sin(x[0]), x[1] * x[2])):
+        np.testing.assert_allclose(fem.dirichletbc(g, dofs, scalar, slope=True).values, both[:, c], atol=1e-10)
+    one = fem.dirichletbc(x[1] * x[2], dofs, V.sub(1), slope=True)
+    np.testing.assert_array_equal(one.dofs, 2 * dofs + 1)
+    np.testing.assert_allclose(one.values, both[:, 1], atol=1e-10)
+
+
+def test_slopes_that_cannot_be_had_are_refused() -> None:
+    V = unit_square()
+    dofs = fem.boundary_dofs(V, slope=True)
+    with pytest.raises(TypeError, match="slope=True needs a UFL expression, whose gradient is known, got function"):
+        fem.dirichletbc(lambda x: x[0], dofs, V, slope=True)
+    x = ufl.SpatialCoordinate(V.mesh)
+    with pytest.raises(ValueError, match="9 of the 49 dofs have neither value nor slope on the boundary, the first is"):
+        fem.dirichletbc(x[0], np.arange(49), V, slope=True)
+    with pytest.raises(ValueError, match="the value is not finite on 8 of the 16 edges"):
+        fem.dirichletbc(sqrt(x[1] - 0.5), dofs, V, slope=True)
 
 
 def test_positions_cover_the_surface() -> None:

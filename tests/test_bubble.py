@@ -489,3 +489,15 @@ def test_l_domain() -> None:
     assert -2.5 < slope < -1.5  # -1.9 was measured; -1.5 is optimal, and what was lost before is caught up
     assert is_constant(effectivity)
     assert 0.35 < effectivity.min() < effectivity.max() < 0.5
+
+
+def test_integrals_over_edges_do_not_matter() -> None:
+    """Bubbles vanish there."""
+    V = randomly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3)))
+    u, v, n = ufl.TrialFunction(V), ufl.TestFunction(V), ufl.FacetNormal(V.mesh)
+    uh = fem.Function(V)
+    uh.x.array = np.random.default_rng(0).random(V.num_dofs)
+    a, L = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx, v * ufl.dx
+    expected = estimate.bubble(uh, a, L)
+    robin, penalty = u * v * ufl.ds, ufl.jump(ufl.grad(u), n) * ufl.avg(v) * ufl.dS
+    np.testing.assert_array_equal(estimate.bubble(uh, a + robin + penalty, L + 3.0 * v * ufl.ds), expected)

@@ -10,6 +10,8 @@ from problems import errors, poisson, projected_in_h1, randomly_refined, smooth,
 import ufl
 from thccs_fem import estimate, fem, generators
 from thccs_fem.extraction import evaluate_pieces
+from thccs_fem.fem.scipy import LinearProblem
+from thccs_fem.mesh import ControlMesh
 from ufl import div, grad
 
 Floats = npt.NDArray[np.float64]
@@ -172,7 +174,86 @@ def test_residual_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
     assert max(effectivities) < 10.0  # 6.5 on regular meshes, 7.8 and 9.8 at valences 5 and 8
 
 
-def test_neumann_is_refused() -> None:
-    uh = fem.Function(planar(times=0))
-    with pytest.raises(NotImplementedError, match="boundary integrals are not supported yet"):
-        estimate.residual(uh, div(grad(uh)), neumann=ufl.as_ufl(1.0))
+def test_residual_of_a_neumann_condition() -> None:
+    V = fem.functionspace(tagged_rectangle(), ("THCCS", 3))  # 4 x 2 cells of 1/4 x 1/2 on the unit square
+    f, g = fem.Constant(V.mesh, 3.0), fem.Constant(V.mesh, 2.0)
+    h, area = np.sqrt(1 / 8), 1 / 8
+    at_left, at_bottom = np.arange(8) % 4 == 0, np.arange(8) < 4
+    right, top = np.arange(8) % 4 == 3, np.arange(8) >= 4
+    around = 0.5 * at_left + 0.5 * right + 0.25 * at_bottom + 0.25 * top  # lengths
+    inside = h**2 * 9.0 * area
+    eta = estimate.residual(fem.Function(V), f, g)
+    np.testing.assert_allclose(eta**2, inside + h * 4.0 * around, rtol=1e-13)
+    eta = estimate.residual(fem.Function(V), f, {1: g, 2: 2.0 * g})
+    np.testing.assert_allclose(eta**2, inside + h * (4.0 * 0.5 * at_left + 16.0 * 0.25 * at_bottom), rtol=1e-13)
+    vector = estimate.residual(fem.Function(V), f, {1: ufl.as_vector([g, f])})
+    np.testing.assert_allclose(vector**2, inside + h * 13.0 * 0.5 * at_left, rtol=1e-13)
+    with pytest.raises(ValueError, match=r"the form has ds\(5\), but tags"):
+        estimate.residual(fem.Function(V), f, {5: g})
+
+
+def tagged_rectangle() -> ControlMesh:
+    """Return the unit square of 4 x 2 faces with tags 1 on the left and 2 at the bottom."""
+    msh = generators.rectangle((4, 2))
+    x = msh.vertices[msh.edges].mean(axis=1)
+    tags = {tuple(map(int, e)): 1 if m[0] == 0.0 else 2 for e, m in zip(msh.edges, x, strict=True) if 0.0 in m}
+    return ControlMesh(msh.vertices, msh.quads, edge_tags=tags, corners=msh.corners)
+
+
+def test_jumps_of_the_flux() -> None:
+    """With u = x[0], and kappa 5 on the right half, kappa grad(u).n jumps by 4 in the middle."""
+    V = fem.functionspace(generators.rectangle((4, 2)), ("THCCS", 3))
+    kappa = fem.Function(fem.functionspace(V.mesh, ("DG", 0)))
+    kappa.x.array = np.tile([1.0, 1.0, 5.0, 5.0], 2)
+    uh, f, h = coordinate(V), fem.Constant(V.mesh, 3.0), np.sqrt(1 / 8)
+    eta = estimate.residual(uh, f, flux=kappa * grad(uh))
+    at_middle = np.isin(np.arange(8) % 4, [1, 2])
+    np.testing.assert_allclose(eta**2, h**2 * 9 / 8 + h / 2 * 16.0 * 0.5 * at_middle, rtol=1e-11)
+
+
+def test_jumps_of_a_tensor() -> None:
+    V = fem.functionspace(generators.rectangle((4, 2)), ("THCCS", 3))
+    kappa = fem.Function(fem.functionspace(V.mesh, ("DG", 0)))
+    kappa.x.array = np.tile([1.0, 1.0, 5.0, 5.0], 2)
+    uh, f = coordinate(V), fem.Constant(V.mesh, 3.0)
+    scalar = estimate.residual(uh, f, flux=kappa * grad(uh))
+    tensor = kappa * grad(ufl.as_vector([0.6 * uh, 0.8 * uh]))
+    np.testing.assert_allclose(estimate.residual(uh, f, flux=tensor), scalar, rtol=1e-13)
+
+
+def test_jumps_at_caps_are_a_small_part() -> None:
+    V = uniformly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3)))
+    exact = wavy(ufl.SpatialCoordinate(V.mesh))
+    uh = poisson(V, exact, 6.25 * exact)
+    strong = 6.25 * exact + div(grad(uh))
+    without, together = (estimate.residual(uh, strong, flux=flux) for flux in (None, grad(uh)))
+    assert (together >= without).all()
+    added = together**2 - without**2
+    irregular = V.cells.level_face[np.argsort(-added)[:5]]  # the cells around the vertex of valence 5
+    level = V.hierarchy.stages[V.cells.level.max()].level
+    assert (~level.regular)[level.quads[irregular]].any(axis=1).all()
+    assert 1e-8 < added.sum() < 0.01 * (without**2).sum()
+
+
+@pytest.mark.parametrize("valence", [4, 5])
+def test_residual_with_a_neumann_condition_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
+    """-div(grad(u)) + u = f with grad(u).n = g on the whole boundary."""
+    V = fem.functionspace(generators.wheel(valence, 2), ("THCCS", 3))
+    exact, n = wavy(ufl.SpatialCoordinate(V.mesh)), ufl.FacetNormal(V.mesh)
+    f, g = 7.25 * exact, ufl.dot(grad(exact), n)
+    effectivities = []
+    for _ in range(4):
+        V = uniformly_refined(V)
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        a, L = (ufl.inner(grad(u), grad(v)) + u * v) * ufl.dx, f * v * ufl.dx + g * v * ufl.ds
+        uh = LinearProblem(a, L).solve()
+        eta = estimate.residual(uh, f + div(grad(uh)) - uh, g - ufl.dot(grad(uh), n), grad(uh))
+        effectivities.append(estimate.norm(V, eta) / errors(uh, exact)[1])
+    assert 5.0 < min(effectivities)
+    assert max(effectivities) < 12.0
+
+
+def test_functions_on_finer_cells_are_refused_on_edges() -> None:
+    coarse = planar(times=0)
+    with pytest.raises(ValueError, match="functions on a refinement of the cells"):
+        estimate.residual(fem.Function(coarse), ufl.as_ufl(1.0), with_random_values(randomly_refined(coarse)))

@@ -180,3 +180,18 @@ def test_points_on_pieces_are_points_on_faces() -> None:
     np.testing.assert_allclose(values, u.eval(faces, uv), rtol=1e-13)
     x = fem.Expression(ufl.SpatialCoordinate(V.mesh), POINTS[1:2]).eval(V, piece)[:, 0]
     np.testing.assert_allclose(x, limit.evaluate(V.mesh, faces, uv)[0], atol=1e-14)
+
+
+def test_functions_that_are_constant_on_cells() -> None:
+    V = fem.functionspace(ZOO["wheel5"](), SCALAR)
+    fine = adapt.refine(V, [0, 5])
+    k, r = fem.Function(fem.functionspace(V.mesh, ("DG", 0))), fem.Function(fem.cellwise(V, (2,)))
+    k.x.array, r.x.array = np.arange(V.mesh.num_faces), np.random.default_rng(0).random(2 * V.num_cells)
+    u = with_random_values(fine)
+    values = fem.Expression(k * u * r, POINTS).eval(fine, every_piece(fine))
+    factor = k.x.array[:, None] * r.x.array.reshape(-1, 2)  # cells of V are the faces
+    expected = (
+        fem.Expression(u, POINTS).eval(fine, every_piece(fine)) * factor[fine.cells.face[fine.cells.piece_cell], None]
+    )
+    np.testing.assert_allclose(values, expected, rtol=1e-13)
+    assert not fem.Expression(grad(k), POINTS).eval(fine, every_piece(fine)).any()

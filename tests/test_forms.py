@@ -13,7 +13,8 @@ from thccs_fem import element, fem, generators
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.mesh import ControlMesh
-from ufl import div, dx, exp, grad, inner, sin
+from thccs_fem.quadrature import paper_cells
+from ufl import div, dP, dS, ds, dx, exp, grad, inner, sin
 
 
 def tagged_mesh() -> ControlMesh:
@@ -105,6 +106,53 @@ def test_integrals_know_their_tags_and_coefficients() -> None:
     assert used == {None: [w], 0: [], 1: [], 2: [f]}
 
 
+def test_integrals_over_edges_know_their_kind_and_tag() -> None:
+    msh = generators.rectangle((3, 3))
+    edges = [tuple(map(int, edge)) for edge in msh.edges]
+    inside = np.flatnonzero(msh.edge_faces[:, 1] >= 0)
+    tags = {edges[inside[0]]: 4, edges[inside[1]]: 5, edges[msh.boundary_edges[0]]: 6}
+    V = fem.functionspace(ControlMesh(msh.vertices, msh.quads, edge_tags=tags), ("THCCS", 3))
+    f, v = fem.Function(V), ufl.TestFunction(V)
+    form = fem.form(v * dx + f * v * ds(6) + v * ds + ufl.avg(v) * dS((5, 4)))
+    found = [(integral.kind, integral.tag, integral.reads) for integral in form.integrals]
+    assert found == [
+        ("cell", None, (False,)),
+        ("exterior_facet", None, (False,)),
+        ("exterior_facet", 6, (True,)),
+        ("interior_facet", 4, (False,)),
+        ("interior_facet", 5, (False,)),
+    ]
+
+
+def test_quadrature_degree_on_edges_is_that_in_cells() -> None:
+    assert degrees(fem.form(w * u * v * ds + ufl.jump(u) * ufl.avg(v) * dS)) == [9, 7]
+
+
+def test_blocks_of_a_mixed_form_are_forms() -> None:
+    mixed = ufl.MixedFunctionSpace(V, W)
+    (u, p), (v, q) = ufl.TrialFunctions(mixed), ufl.TestFunctions(mixed)
+    F = (inner(grad(u), grad(v)) + inner(p, q) + div(p) * v) * dx + u * q[1] * ds
+    blocks = [[fem.form(block) for block in row] for row in ufl.extract_blocks(F)]
+    assert [[form.spaces for form in row] for row in blocks] == [[(V, V), (V, W)], [(W, V), (W, W)]]
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    expected = fem.assemble_matrix(fem.form(inner(grad(u), grad(v)) * dx))
+    assert (fem.assemble_matrix(blocks[0][0]) != expected).nnz == 0
+
+
+def test_cells_may_be_those_of_a_cellwise_function() -> None:
+    fine = refined(V, [V.num_dofs // 2])
+    h = fem.cell_sizes(fine)
+    form = fem.form(h**2 * v * dx)
+    assert form.cells is fine.cells
+    assert set(form.transfers) == {V.hierarchy}
+    assert fem.form(constant * dx, on=fine).cells is fine.cells
+    coarse = fem.cell_sizes(V)
+    assert fem.form(coarse * ufl.TestFunction(fine) * dx).cells is fine.cells
+    assert fem.assemble_scalar(fem.form(coarse**-2 * dx, on=fine)) == pytest.approx(V.num_cells, rel=1e-13)
+    assert fem.assemble_scalar(fem.form(h**-2 * dx)) == pytest.approx(fine.num_cells, rel=1e-13)
+    assert fem.form(constant * dx).cells.num_cells == MESH.num_faces
+
+
 def test_compiled_form_is_returned_as_it_is() -> None:
     form = fem.form(v * dx)
     assert fem.form(form) is form
@@ -160,7 +208,8 @@ def test_space_to_integrate_on_may_be_given() -> None:
 
 lagrange = ufl.FunctionSpace(MESH.ufl_domain(), basix.ufl.element("Lagrange", "quadrilateral", 3))
 other_mesh = ufl.Mesh(element.coordinate_element(2))
-ds, dS = ufl.ds(domain=MESH), ufl.dS(domain=MESH)
+constant = fem.Function(fem.functionspace(MESH, ("DG", 0)))
+n = ufl.FacetNormal(MESH)
 
 REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "no form": (
@@ -169,8 +218,41 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "form needs a sum of UFL integrals, got Product: is there a * ufl.dx missing?",
     ),
     "zero": (lambda: 0 * v * dx(domain=MESH), ValueError, "the form is zero.*fem.Constant(msh, 0.0) * v * ufl.dx"),
-    "rim": (lambda: v * ds, NotImplementedError, "an integral over ds (exterior_facet); only dx is implemented"),
-    "edges": (lambda: v("+") * dS, NotImplementedError, "an integral over dS (interior_facet)"),
+    "points": (lambda: v * dP(domain=MESH), NotImplementedError, "over dP (vertex); there are dx, ds and dS only"),
+    "argument of no side": (
+        lambda: inner(grad(u), grad(v)) * dS,
+        ValueError,
+        "Discontinuous type Argument must be restricted. In integrals over dS .* write w('+'), w('-'), jump(w)",
+    ),
+    "coefficient of no side": (
+        lambda: constant * v("+") * dS,
+        ValueError,
+        "Discontinuous type Coefficient must be restricted. In integrals over dS each side has its own value",
+    ),
+    "normal of no side": (lambda: n[0] * v("+") * dS, ValueError, "must be restricted. In integrals over dS"),
+    "a side in dx": (lambda: v("+") * dx, ValueError, "the form has (v_0)(+) in dx: jump, avg, '+' and '-' have"),
+    "a mean on the boundary": (
+        lambda: ufl.avg(v) * ds,
+        ValueError,
+        "in ds: jump, avg, '+' and '-' have a meaning",
+    ),
+    "normal in dx": (lambda: n[0] * v * dx, ValueError, "the form has FacetNormal in dx: the normal of the boundary"),
+    "subdomain data on edges": (
+        lambda: v * ds(subdomain_data=[1]),
+        ValueError,
+        "tags belong to the mesh here: ControlMesh(..., edge_tags={(i, j): tag}) and ds(tag)",
+    ),
+    "unknown tag of edges": (lambda: v * ds(3), ValueError, "ds(3), but tags are from 0, and those of edges on its"),
+    "cellwise argument": (
+        lambda: ufl.TestFunction(constant.space) * dx,
+        ValueError,
+        "v_0 is constant on each cell, but test and trial .* integrals over each cell come from fem.assemble_cells",
+    ),
+    "several blocks": (
+        lambda: sum(ufl.TestFunctions(ufl.MixedFunctionSpace(V, V))) * dx,
+        ValueError,
+        "of several blocks at once: take it apart by ufl.extract_blocks(F)",
+    ),
     "subdomain data": (lambda: v * dx(subdomain_data=[1]), ValueError, "the measure has subdomain_data; tags belong"),
     "unknown tag": (
         lambda: v * dx(7),
@@ -194,7 +276,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "cell size": (
         lambda: ufl.CellDiameter(MESH) * v * dx,
         ValueError,
-        "the form has CellDiameter, .* hand the cell size in",
+        "the form has CellDiameter, .* use h = fem.cell_sizes(V)",
     ),
     "cell volume": (lambda: ufl.CellVolume(MESH) * v * dx, ValueError, "the form has CellVolume"),
     "two meshes": (
@@ -216,3 +298,11 @@ def test_what_is_refused_is_named(make: Callable[[], object], error: type[Except
     pattern = ".*".join(re.escape(part) for part in message.split(".*"))
     with pytest.raises(error, match=pattern):
         fem.form(make())
+
+
+def test_edges_of_cells_for_dx_alone_are_refused() -> None:
+    W = V.with_integration(paper_cells)
+    v = ufl.TestFunction(W)
+    with pytest.raises(ValueError, match="integrals over dS and ds, but its spaces come from with_integration"):
+        fem.form(v * dx + v * ds + ufl.avg(v) * dS)
+    assert fem.form(constant * v * dx).cells is W.integration_cells

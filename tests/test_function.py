@@ -5,6 +5,7 @@ import pytest
 from refinements import geometry_dofs, random_positions
 from zoo import ZOO
 
+import ufl
 from thccs_fem import adapt, fem, generators, limit
 from thccs_fem.fem.space import FunctionSpace
 
@@ -117,3 +118,32 @@ def test_constants_keep_their_shape() -> None:
     assert v.value.tolist() == [4.0, 2.0, 1.0]
     with pytest.raises(ValueError, match="broadcast"):
         v.value = np.ones(2)
+
+
+# ---- Constant on each cell
+
+
+@pytest.mark.parametrize("name", ["wheel5", "polygons", "cube"])
+def test_cellwise_values_are_those_of_the_face_or_cell(name: str) -> None:
+    V = refined(name)
+    faces, uv, corners = random_positions(V.hierarchy, 200)
+    on_faces = fem.Function(fem.functionspace(V.mesh, ("DG", 0)), name="k")
+    on_faces.x.array = np.arange(V.mesh.num_faces)
+    np.testing.assert_array_equal(on_faces.eval(faces, uv, corners), faces)
+    on_cells = fem.Function(fem.cellwise(V, (2,)))
+    on_cells.x.array = np.arange(2 * V.num_cells)
+    piece, _ = V.cells.locate(faces, uv, corners)
+    cell = V.cells.piece_cell[piece]
+    np.testing.assert_allclose(on_cells.eval(faces, uv, corners), np.column_stack([2 * cell, 2 * cell + 1]), rtol=1e-13)
+    assert on_cells.copy().space == on_cells.space
+    assert on_cells.local_coefficients().shape == (V.cells.num_pieces, 16, 2)
+
+
+def test_sizes_of_cells_are_roots_of_areas() -> None:
+    V = adapt.refine(fem.functionspace(generators.rectangle((4, 2)), SCALAR), [0])
+    h = fem.cell_sizes(V)
+    assert h.name == "h"
+    np.testing.assert_allclose(h.x.array, np.sqrt(1 / 8) * 0.5**V.cells.level, rtol=1e-14)
+    sphere = refined("tripod")
+    areas = fem.assemble_cells(fem.form(1.0 * ufl.dx(domain=sphere.mesh), on=sphere))
+    np.testing.assert_allclose(fem.cell_sizes(sphere).x.array ** 2, areas, rtol=1e-13)  # the same 4 x 4 points

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from thccs_fem import generators, subdivision
+from thccs_fem import generators, limit, subdivision
 from thccs_fem.mesh import ControlMesh
 
 Floats = npt.NDArray[np.float64]
@@ -298,6 +298,140 @@ def test_genus3_base_has_no_tags() -> None:
     assert not generators.genus3(levels=0).face_tags.any()
 
 
+# Shells
+
+
+SHELLS = {
+    "cylinder": generators.cylinder((8, 3), R=2.0, length=5.0),
+    "strip": generators.cylinder((6, 3), R=2.0, length=5.0, angle=1.5, rim=0.5),
+    "zone": generators.spherical_zone((9, 4), R=2.0),
+    "graded zone": generators.spherical_zone((9, 4), R=2.0, polar=(0.5, 2.5), rim=0.3),
+    "hemisphere": generators.hemisphere(3, R=2.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "counts", "extraordinary"),
+    [
+        ("cylinder", (32, 24, 2), {}),
+        ("strip", (28, 18, 1), {}),
+        ("zone", (45, 36, 2), {}),
+        ("graded zone", (45, 36, 2), {}),
+        ("hemisphere", (121, 108, 1), {3: 4}),
+    ],
+)
+def test_shell_counts(name: str, counts: tuple[int, ...], extraordinary: dict[int, int]) -> None:
+    mesh = SHELLS[name]
+    assert (mesh.num_vertices, mesh.num_faces, len(mesh.boundary_loops)) == counts
+    assert valences(mesh) == extraordinary
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_shell_normals_are_outward(name: str) -> None:
+    mesh = SHELLS[name]
+    a, b, c, d = mesh.vertices[mesh.quads].swapaxes(0, 1)
+    outward = (a + b + c + d) * ([1, 1, 0] if name in ("cylinder", "strip") else [1, 1, 1])
+    assert (np.einsum("fi,fi->f", np.cross(c - a, d - b), outward) > 0).all()
+
+
+def test_cylinder_is_a_cylinder_numbered_row_by_row() -> None:
+    strip = SHELLS["strip"]
+    x, y, z = strip.vertices.reshape(4, 7, 3).T
+    np.testing.assert_allclose(np.hypot(x, y), 2.0, rtol=1e-14)
+    np.testing.assert_allclose(z, np.broadcast_to(np.linspace(-2.5, 2.5, 4), (7, 4)), atol=1e-14)
+    angle = np.arctan2(y, x)[:, 0]
+    np.testing.assert_allclose(angle[[0, 3, 6]], [-0.75, 0.0, 0.75], atol=1e-14)
+    assert (np.diff(angle, 2)[:2] > 0.0).all()  # narrow faces at the straight edges, wide ones in the middle
+    closed = SHELLS["cylinder"].vertices.reshape(4, 8, 3)
+    np.testing.assert_allclose(closed[0, [0, 4]], [[-2.0, 0.0, -2.5], [2.0, 0.0, -2.5]], atol=1e-14)
+
+
+@pytest.mark.parametrize("rim", [0.1, 0.5, 1.0])
+def test_rim_is_the_width_there_compared_to_equal_faces(rim: float) -> None:
+    n = 400
+    strip = generators.cylinder((n, 1), angle=1.0, rim=rim)
+    x, y, _ = strip.vertices[: n + 1].T
+    widths = np.diff(np.arctan2(y, x))
+    np.testing.assert_allclose(widths, widths[::-1], atol=1e-14)
+    assert widths[0] * n == pytest.approx(rim, abs=1e-4)  # 10 (1 - rim) / n^2 more
+    assert widths[0] == widths.min() or rim == 1.0
+
+
+def test_spherical_zone_is_between_two_circles() -> None:
+    for name, circles in (("zone", (math.pi / 10, math.pi / 2)), ("graded zone", (0.5, 2.5))):
+        vertices = SHELLS[name].vertices
+        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 2.0, rtol=1e-14)
+        polar = np.arccos(vertices[:, 2] / 2.0).reshape(5, 9)
+        np.testing.assert_allclose(polar[[-1, 0], 0], circles, rtol=1e-14)
+        np.testing.assert_allclose(vertices[::9, 1], 0.0, atol=1e-14)
+
+
+def test_hemisphere_is_symmetric_with_an_even_rim() -> None:
+    mesh = SHELLS["hemisphere"]
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 2.0, rtol=1e-14)
+    for mirrored in ([-1, 1, 1], [1, -1, 1]):
+        assert same_points(mesh.vertices, mesh.vertices * mirrored)
+    assert same_points(mesh.vertices, mesh.vertices[:, [1, 0, 2]])
+    x, y, z = mesh.vertices[mesh.boundary_vertices].T
+    np.testing.assert_allclose(z, 0.0, atol=1e-14)
+    np.testing.assert_allclose(np.diff(np.sort(np.arctan2(y, x))), 2.0 * math.pi / 24, rtol=1e-12)
+    assert areas(mesh).max() < 2.5 * areas(mesh).min()
+
+
+# Limits that pass through the vertices
+
+
+def at_corners(mesh: ControlMesh) -> Floats:
+    """Limit points of the corners of all faces, shape (num_faces, 4, 3)."""
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    faces = np.repeat(np.arange(mesh.num_faces), 4)
+    return limit.evaluate(mesh, faces, np.tile(uv, (mesh.num_faces, 1)), derivatives=0)[0].reshape(-1, 4, mesh.gdim)
+
+
+@on({**SHELLS, **CLOSED, **PLANAR})
+def test_interpolated_limits_pass_through_the_vertices(mesh: ControlMesh) -> None:
+    moved = generators.interpolated(mesh)
+    np.testing.assert_allclose(at_corners(moved), mesh.vertices[mesh.quads], atol=1e-11)  # condition number up to 1e2
+
+
+@pytest.mark.parametrize(
+    ("make", "distance", "order"),
+    [
+        (lambda n: generators.cylinder((4 * n, n)), lambda x: np.hypot(x[:, 0], x[:, 1]) - 1.0, 4),
+        (lambda n: generators.torus((4 * n, 2 * n)), lambda x: np.hypot(np.hypot(*x.T[:2]) - 2.0, x[:, 2]) - 1.0, 4),
+        (lambda n: generators.spherical_zone((4 * n, n)), lambda x: np.linalg.norm(x, axis=1) - 1.0, 2),
+        (lambda n: generators.hemisphere(n), lambda x: np.linalg.norm(x, axis=1) - 1.0, 2),
+    ],
+    ids=["cylinder", "torus", "zone", "hemisphere"],
+)
+def test_interpolated_limits_are_near_the_surface(
+    make: Callable[[int], ControlMesh], distance: Callable[[Floats], Floats], order: int
+) -> None:
+    errors = []
+    for n in (4, 8, 16):
+        mesh = generators.interpolated(make(n))
+        uv = np.random.default_rng(0).random((20 * mesh.num_faces, 2))
+        x = limit.evaluate(mesh, np.repeat(np.arange(mesh.num_faces), 20), uv, derivatives=0)[0]
+        errors.append(np.abs(distance(x)).max())
+    slopes = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert ((slopes > order - 0.3) & (slopes < order + 0.4)).all(), slopes
+
+
+def test_interpolated_meshes_keep_what_is_tagged() -> None:
+    plain = generators.l_domain(2)
+    given = ControlMesh(plain.vertices, plain.quads, [3] * 12, {(0, 1): 5}, corners=dict(plain.corners), comm=object())
+    moved = generators.interpolated(given)
+    assert moved.face_tags.tolist() == given.face_tags.tolist()
+    assert (dict(moved.edge_tags), dict(moved.corners), moved.comm) == (
+        dict(given.edge_tags),
+        dict(given.corners),
+        given.comm,
+    )
+    triangle = ControlMesh([(0, 0), (1, 0), (0, 1)], [(0, 1, 2)])
+    with pytest.raises(ValueError, match="not all quads"):
+        generators.interpolated(triangle)
+
+
 # Planar domains
 
 
@@ -480,6 +614,9 @@ MAKERS: dict[str, Callable[..., ControlMesh]] = {
     "l_domain": lambda **comm: generators.l_domain(1, **comm),
     "l_domain1": lambda **comm: generators.l_domain1(**comm),
     "l_domain2": lambda **comm: generators.l_domain2(**comm),
+    "cylinder": lambda **comm: generators.cylinder((5, 2), **comm),
+    "spherical_zone": lambda **comm: generators.spherical_zone((5, 2), **comm),
+    "hemisphere": lambda **comm: generators.hemisphere(2, **comm),
 }
 
 
@@ -522,6 +659,17 @@ def test_meshes_are_repeatable(make: Callable[..., ControlMesh]) -> None:
         (lambda make: make.implicit_surface(lambda x: -(x[0] ** 2), (3, 3, 3)), ValueError, r"positive at no point"),
         (lambda make: make.implicit_surface(lambda x: x[0] * np.nan, (3, 3, 3)), ValueError, r"27 values that are not"),
         (lambda make: make.implicit_surface(lambda x: x, (3, 3, 3)), ValueError, r"f returned 81 values for 27 points"),
+        (lambda make: make.cylinder((0, 1), angle=1.0), ValueError, r"shape\[0\] is 0: expected 1 or more"),
+        (lambda make: make.cylinder((2, 1)), ValueError, r"shape\[0\] of a closed cylinder is 2: expected 3 or more"),
+        (lambda make: make.cylinder((4, 1), R=0.0), ValueError, r"R = 0.0, length = 1.0 and angle"),
+        (lambda make: make.cylinder((4, 1), angle=6.3), ValueError, r"an angle of at most 2 pi"),
+        (lambda make: make.cylinder((4, 1), rim=0.5), ValueError, r"closed cylinder has no straight edges"),
+        (lambda make: make.cylinder((4, 1), angle=1.0, rim=0.0), ValueError, r"rim is 0.0: expected a share above 0"),
+        (lambda make: make.spherical_zone((2, 1)), ValueError, r"shape\[0\] is 2: expected 3 or more"),
+        (lambda make: make.spherical_zone((4, 1), polar=(1.0, 0.5)), ValueError, r"0 < upper < lower < pi"),
+        (lambda make: make.spherical_zone((4, 1), rim=1.5), ValueError, r"rim is 1.5"),
+        (lambda make: make.hemisphere(0), ValueError, r"n is 0: expected 1 or more"),
+        (lambda make: make.hemisphere(2, R=-1.0), ValueError, r"the radius is -1.0"),
         (lambda make: make.disc("3"), TypeError, r"n is '3': expected an integer"),
         (lambda make: make.wheel(2, 3), ValueError, r"valence is 2: expected 3 or more"),
         (lambda make: make.wheel(5, 0), ValueError, r"n is 0: expected 1 or more"),

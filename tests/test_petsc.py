@@ -179,7 +179,7 @@ def test_lifting_and_setting_make_the_system_of_the_linear_problem() -> None:
     bcs = [fem.dirichletbc(x[0] * x[1], fem.boundary_dofs(V), V), fem.dirichletbc(3.0, [5], V)]
     problem = LinearProblem(laplace(V), (1 + x[0]) * v * dx, bcs=bcs, petsc_options_prefix="lifting_")
     problem.solve()
-    a, L = problem._system.a, problem._system.L
+    ((a,),), (L,) = problem._system.a, problem._system.L
     b = petsc.assemble_vector(L)
     petsc.apply_lifting(b, [a], [bcs])
     petsc.set_bc(b, bcs)

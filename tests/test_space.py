@@ -179,3 +179,63 @@ def test_planes_that_fold_are_refused() -> None:
     vertices[12] += [0.9, 0.9]  # the centre goes past its neighbours
     with pytest.raises(ValueError, match="fold"):
         fem.functionspace(ControlMesh(vertices, generators.rectangle((4, 4)).quads), SCALAR)
+
+
+# ---- Functions that are constant on cells
+
+
+def test_cellwise_spaces_count_faces_or_cells() -> None:
+    msh = generators.rectangle((3, 2))
+    on_faces = fem.functionspace(msh, ("DG", 0))
+    assert (on_faces.num_dofs, on_faces.num_cells, on_faces.block_size, on_faces.value_shape) == (6, 6, 1, ())
+    V = fem.functionspace(msh, SCALAR)
+    fine = adapt.refine(V, [0, V.num_functions // 2])
+    on_cells = fem.cellwise(fine, (3,))
+    assert (on_cells.num_dofs, on_cells.num_cells) == (3 * fine.num_cells, fine.num_cells)
+    assert on_cells.cells is fine.cells
+    assert fem.functionspace(msh, ("DG", 0, (2,))).num_dofs == 12
+
+
+def test_cellwise_spaces_are_the_same_if_their_cells_are() -> None:
+    msh = generators.rectangle((3, 2))
+    V = fem.functionspace(msh, SCALAR)
+    fine = adapt.refine(V, [0])
+    on_faces, on_cells = fem.functionspace(msh, ("DG", 0)), fem.cellwise(V)
+    assert on_faces == fem.functionspace(msh, ("DG", 0))
+    assert hash(on_cells) == hash(fem.cellwise(fem.functionspace(msh, SCALAR)))
+    assert on_cells == fem.cellwise(fem.functionspace(msh, SCALAR))
+    others = [
+        on_faces,
+        fem.cellwise(V, (2,)),
+        fem.cellwise(fine),
+        fem.functionspace(generators.torus((4, 5)), ("DG", 0)),
+    ]
+    for other in others:
+        assert on_cells != other
+    assert str(on_cells) == "CellwiseSpace(values (), 6 cells of a hierarchy of 1 levels)"
+    assert str(on_faces) == "CellwiseSpace(values (), 6 cells of a control mesh)"
+
+
+@pytest.mark.parametrize("name", ["grid", "wheel5", "polygons", "tetrahedron", "cube"])
+def test_cells_inherit_what_their_ancestors_have(name: str) -> None:
+    coarse = adapt.refine(space(name), [0, 1])
+    fine = coarse
+    for step in range(2):
+        fine = adapt.refine(fine, np.arange(step, fine.num_functions, 3))
+    dofs = fem.cellwise(coarse).dofs_of(fine.cells)
+    np.testing.assert_array_equal(coarse.cells.face[dofs], fine.cells.face)
+    np.testing.assert_array_equal(fem.cellwise(fine).dofs_of(fine.cells), np.arange(fine.num_cells))
+    np.testing.assert_array_equal(fem.functionspace(fine.mesh, ("DG", 0)).dofs_of(fine.cells), fine.cells.face)
+    areas = [fem.cell_sizes(V).x.array ** 2 for V in (coarse, fine)]
+    # Caps sink where cells come near: areas of irregular cells change a little.
+    np.testing.assert_allclose(np.bincount(dofs, weights=areas[1]), areas[0], rtol=1e-4)
+    with pytest.raises(ValueError, match=r"values of .* cells are not known: .* goes over to finer cells only"):
+        fem.cellwise(fine).dofs_of(coarse.cells)
+
+
+@pytest.mark.parametrize("element", [("DG", 1), ("DG",), ("DP", 0)])
+def test_elements_like_cellwise_ones_are_refused(element: object) -> None:
+    with pytest.raises(
+        ValueError, match=r'it must be .* or \("DG", 0\) for coefficients that are constant on each face'
+    ):
+        fem.functionspace(generators.torus((4, 4)), element)  # type: ignore[call-overload]

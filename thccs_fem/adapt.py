@@ -2,6 +2,9 @@
 
 What is refined is always the support of functions: refining elements that hold no whole support would change nothing
 (sec. 4 of the paper).  A function's indicator is the root of the sum of eta^2 over the cells of its support (eq. 32).
+
+What is coarsened are cells, by one level: those marked, as far as whole functions of the coarser level allow.  Between
+two time steps `remesh` does both and `transfer` carries the solution over.
 """
 
 from __future__ import annotations
@@ -18,9 +21,11 @@ import scipy.sparse as sp
 from thccs_fem import estimate
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.project import projected_over
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.hierarchy import Hierarchy
 
-__all__ = ["History", "Step", "mark", "refine", "solve", "transfer"]
+__all__ = ["History", "Step", "coarsen", "mark", "mark_coarsening", "refine", "remesh", "solve", "transfer"]
 
 Floats = npt.NDArray[np.float64]
 Strategy = Literal["worst", "maximum", "dorfler"]
@@ -44,12 +49,7 @@ def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: f
         ValueError: If eta does not fit the cells or is negative or not finite, or strategy or theta is unknown.
     """
     cells = V.cells
-    eta = np.asarray(eta, dtype=np.float64)
-    if eta.shape != (cells.num_cells,):
-        raise ValueError(f"eta has shape {eta.shape}; it needs one value for each of the {cells.num_cells} cells")
-    if not np.isfinite(eta).all() or (eta < 0.0).any():
-        bad = int(np.flatnonzero(~np.isfinite(eta) | (eta < 0.0))[0])
-        raise ValueError(f"eta of cell {bad} is {eta[bad]}; indicators must be finite and not negative")
+    eta = _checked(cells, eta)
     if strategy not in ("worst", "maximum", "dorfler"):
         raise ValueError(f'strategy is {strategy!r}; it must be "worst", "maximum" or "dorfler"')
     if not 0.0 < theta <= 1.0:
@@ -63,6 +63,42 @@ def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: f
     if strategy == "maximum":
         return np.flatnonzero(indicator >= theta * indicator.max())
     return _dorfler(supports, indicator, eta**2, theta)
+
+
+def mark_coarsening(V: FunctionSpace, eta: Floats, theta: float = 0.05) -> npt.NDArray[np.int64]:
+    """Mark cells for coarsening: the most cells, the smallest indicators first, that carry theta of the sum of squares.
+
+    The counterpart of "dorfler" (Schmidt and Siebert, Design of Adaptive Finite Element Software, 2005, sec. 1.5.3).
+    Elements twice as wide have indicators up to 2^3 times as large (2^4 in L2): a small theta leaves room for that.
+
+    Args:
+        V: The space.
+        eta: Indicator of each cell, not squared, shape (num_cells,), local.
+        theta: What the marked cells may carry, in [0, 1); at 0 those without any error are marked.
+
+    Returns:
+        Cell numbers, ascending, local, shape (m,).
+
+    Raises:
+        ValueError: If eta does not fit the cells or is negative or not finite, or theta is out of range.
+    """
+    squares = _checked(V.cells, eta) ** 2
+    if not 0.0 <= theta < 1.0:
+        raise ValueError(f"theta is {theta}; it must lie in [0, 1)")
+    order = np.argsort(squares, kind="stable")
+    carried = np.cumsum(squares[order])
+    return np.sort(order[carried <= theta * carried[-1]])
+
+
+def _checked(cells: Cells, eta: npt.ArrayLike) -> Floats:
+    """Return indicators as an array."""
+    eta = np.asarray(eta, dtype=np.float64)
+    if eta.shape != (cells.num_cells,):
+        raise ValueError(f"eta has shape {eta.shape}; it needs one value for each of the {cells.num_cells} cells")
+    if not np.isfinite(eta).all() or (eta < 0.0).any():
+        bad = int(np.flatnonzero(~np.isfinite(eta) | (eta < 0.0))[0])
+        raise ValueError(f"eta of cell {bad} is {eta[bad]}; indicators must be finite and not negative")
+    return eta
 
 
 def _supports(cells: Cells) -> sp.csr_array:
@@ -98,22 +134,110 @@ def refine(V: FunctionSpace, marked: npt.ArrayLike) -> FunctionSpace:
         ValueError: If a number is out of range.
         TypeError: If the numbers are no integers.
     """
+    functions = _functions(V, marked)
+    return V.with_hierarchy(V.hierarchy.refined(functions)) if functions.size else V
+
+
+def coarsen(V: FunctionSpace, cells: npt.ArrayLike) -> FunctionSpace:
+    """Return the space in which the marked cells are coarsened by one level, where whole functions allow it.
+
+    A cell that is marked may stay; one that is not never goes. V is unchanged, and refines the result.
+
+    Args:
+        V: The space.
+        cells: Cell numbers, local, shape (m,), or marks, bool, shape (num_cells,).
+
+    Returns:
+        The space; V itself if nothing changes.
+
+    Raises:
+        ValueError: If a number is out of range, or the marks are not one for each cell.
+        TypeError: If the cells are neither integers nor marks.
+    """
+    return _on(V, V.hierarchy.coarsened(_cells(V, cells)))
+
+
+def remesh(V: FunctionSpace, marked: npt.ArrayLike, cells: npt.ArrayLike) -> FunctionSpace:
+    """Return the space refined where functions are marked and coarsened where cells are, where that undoes none of it.
+
+    Cells that the refinement needs stay, marked or not: what `refine` would have done to the supports of the marked
+    functions is done.
+
+    Args:
+        V: The space.
+        marked: Function numbers as for `refine`, shape (m,).
+        cells: Cell numbers, shape (n,), or marks, as for `coarsen`.
+
+    Returns:
+        The space; V itself if nothing changes.
+
+    Raises:
+        ValueError: If a number is out of range, or the marks are not one for each cell.
+        TypeError: If the functions are no integers, or the cells neither integers nor marks.
+    """
+    return _on(V, V.hierarchy.remeshed(_functions(V, marked), _cells(V, cells)))
+
+
+def _on(V: FunctionSpace, hierarchy: Hierarchy) -> FunctionSpace:
+    return V if hierarchy is V.hierarchy else V.with_hierarchy(hierarchy)
+
+
+def _functions(V: FunctionSpace, marked: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Return marked functions as numbers, ascending."""
     functions = np.unique(np.asarray(marked))
     if functions.size and not np.issubdtype(functions.dtype, np.integer):
         raise TypeError(f"marked functions must be integers (see adapt.mark), got {functions.dtype}")
     if functions.size and (functions[0] < 0 or functions[-1] >= V.num_functions):
         raise ValueError(f"functions run from 0 to {V.num_functions - 1}; got {functions[0]} to {functions[-1]}")
-    return V.with_hierarchy(V.hierarchy.refined(functions)) if functions.size else V
+    return functions.astype(np.int64)
 
 
-def transfer(u: Function, V: FunctionSpace) -> Function:
-    """Return u in a refined space: the same function of the surface, since the spaces are nested.
+def _cells(V: FunctionSpace, cells: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Return marked cells as numbers, ascending."""
+    marked = np.asarray(cells)
+    if marked.dtype == np.bool_:
+        if marked.shape != (V.num_cells,):
+            raise ValueError(f"marks have shape {marked.shape}; there must be one for each of the {V.num_cells} cells")
+        return np.flatnonzero(marked)
+    numbers = np.unique(marked)
+    if numbers.size and not np.issubdtype(numbers.dtype, np.integer):
+        raise TypeError(f"marked cells must be integers or bools (see adapt.mark_coarsening), got {numbers.dtype}")
+    if numbers.size and (numbers[0] < 0 or numbers[-1] >= V.num_cells):
+        raise ValueError(f"cells run from 0 to {V.num_cells - 1}; got {numbers[0]} to {numbers[-1]}")
+    return numbers.astype(np.int64)
+
+
+def transfer(u: Function, V: FunctionSpace, projection: Literal["L2", "H1"] = "L2") -> Function:
+    """Return u in another space of the same mesh: the same function if V refines the space of u, else the nearest.
+
+    The projection is over the cells of the coarsest refinement of both spaces. It keeps functions that lie in V, and
+    the integral of u over these cells to rounding (with "H1" too: constants are test functions, and have no gradient).
+    On surfaces, integrals over the cells of either space differ from it by what quadrature leaves.
+
+    Where a cap at an extraordinary vertex sinks or rises (elements at or below `cap_level`), the spaces are on surfaces
+    that differ inside the cap: coefficients are carried over as they are. A space made with a larger `cap_level` avoids
+    it.
+
+    Args:
+        u: The function.
+        V: The space, from that of u by `refine`, `coarsen` and `remesh`.
+        projection: The norm in which the result is nearest to u: "L2", or "H1", that of (u, v) + (grad u, grad v).
 
     Raises:
-        ValueError: If V is no refinement of the space of u.
+        ValueError: If the spaces are not on the same mesh with the same boundary rule, or their values have different
+            shapes, or the projection is none of ours.
     """
+    W = u.function_space
+    if projection not in ("L2", "H1"):
+        raise ValueError(f'projection is {projection!r}; it must be "L2" or "H1"')
+    if W.value_shape != V.value_shape:
+        raise ValueError(f"values of shape {W.value_shape} cannot be carried to shape {V.value_shape}")
     result = Function(V, u.name)
-    result.x.array = V.prolongation(u.function_space) @ u.x.array
+    common = V.hierarchy.common_refinement(W.hierarchy)
+    if common is V.hierarchy:
+        result.x.array = V.prolongation(W) @ u.x.array
+    else:
+        result.x.array = projected_over(FunctionSpace(common, (), V.integration), u, V, projection)
     return result
 
 

@@ -21,6 +21,9 @@ NUM_FUNCTIONS = (DEGREE + 1) ** 2
 _TO_BERNSTEIN_TIMES_6 = np.array([[1, 4, 1, 0], [0, 4, 2, 0], [0, 2, 4, 0], [0, 1, 4, 1]])
 _TO_BSPLINE = np.array([[6, -7, 2, 0], [0, 2, -1, 0], [0, -1, 2, 0], [0, 2, -7, 6]])  # its inverse, times 6
 
+# The monomials' coefficients, constant first, of the four uniform cubic B-splines on [0, 1], times 6.
+_TO_MONOMIALS_TIMES_6 = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
+
 #: Bernstein coefficients = TO_BERNSTEIN @ B-spline coefficients, shape (16, 16).
 TO_BERNSTEIN: npt.NDArray[np.float64] = np.kron(_TO_BERNSTEIN_TIMES_6, _TO_BERNSTEIN_TIMES_6) / 36
 #: B-spline coefficients = TO_BSPLINE @ Bernstein coefficients, shape (16, 16): integers, none above 49.
@@ -51,6 +54,27 @@ def bernstein_slopes(t: npt.ArrayLike) -> npt.NDArray[np.float64]:
 def bspline_slopes(t: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return the derivatives of the four uniform cubic B-splines, as a last axis of length 4."""
     return bernstein_slopes(t) @ (_TO_BERNSTEIN_TIMES_6 / 6)
+
+
+def restrictions(origin: npt.NDArray[np.float64], axes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the matrices that take local B-spline coefficients of bicubic polynomials to those on other squares.
+
+    Args:
+        origin: Corner (0, 0) of each square, in the coordinates of the piece, shape (n, 2).
+        axes: Its edges u and v there, in columns, one of them along x and the other along y, shape (n, 2, 2).
+
+    Returns:
+        Shape (n, 16, 16).
+    """
+    # Coefficient j of a cubic f is its polar form at the knots around it, f[j - 2, j - 1, j].
+    step = axes.sum(axis=2)
+    s, t, r = (origin[:, :, None] + step[:, :, None] * (np.arange(4) - shift) for shift in (2, 1, 0))
+    polar = np.stack([np.ones_like(s), (r + s + t) / 3.0, (r * s + s * t + t * r) / 3.0, r * s * t], axis=-1)
+    along_x, along_y = (polar @ (_TO_MONOMIALS_TIMES_6 / 6.0)).swapaxes(0, 1)
+    products = np.einsum("njl,nik->njilk", along_y, along_x)
+    turned = axes[:, 0, 0] == 0.0  # there x depends on v
+    products[turned] = products[turned].swapaxes(1, 2)
+    return products.reshape(-1, 16, 16)
 
 
 @functools.cache
@@ -89,6 +113,12 @@ def blocked(shape: tuple[int, ...]) -> basix.ufl._ElementBase:
     Component c (in C order) of function i has the local number ``i * block size + c``.
     """
     return basix.ufl.blocked_element(bspline(), shape=shape) if shape else bspline()
+
+
+@functools.cache
+def constant(shape: tuple[int, ...]) -> basix.ufl._ElementBase:
+    """Return the element of functions that are constant on each piece, with values of the shape."""
+    return basix.ufl.element("DG", "quadrilateral", 0, shape=shape or None)
 
 
 def coordinate_element(gdim: int) -> basix.ufl._ElementBase:

@@ -5,7 +5,7 @@ Indicators are not squared; `norm` sums them up.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Literal
 
 import numpy as np
@@ -22,12 +22,13 @@ from ufl.corealg.traversal import unique_pre_traversal
 __all__ = ["bubble", "error", "norm", "residual"]
 
 Floats = npt.NDArray[np.float64]
+Expr = ufl.core.expr.Expr
 QUADRATURE_DEGREE = 11  # 6 x 6 Gauss points: the error is no polynomial
 
 
 def error(
     uh: Function,
-    u_exact: ufl.core.expr.Expr | Callable[[ufl.SpatialCoordinate], ufl.core.expr.Expr],
+    u_exact: Expr | Callable[[ufl.SpatialCoordinate], Expr],
     norm: Literal["L2", "H1"] = "L2",
 ) -> Floats:
     """Return the norm of the error on each cell.
@@ -46,7 +47,7 @@ def error(
     V = uh.function_space
     if norm not in ("L2", "H1"):
         raise ValueError(f'norm is {norm!r}; it must be "L2" or "H1"')
-    exact = u_exact if isinstance(u_exact, ufl.core.expr.Expr) else u_exact(ufl.SpatialCoordinate(V.mesh))
+    exact = u_exact if isinstance(u_exact, Expr) else u_exact(ufl.SpatialCoordinate(V.mesh))
     e = uh - exact
     density = ufl.inner(e, e)
     if norm == "H1":
@@ -55,28 +56,57 @@ def error(
     return np.sqrt(np.maximum(_over_cells(V, density), 0.0))
 
 
-def residual(uh: Function, strong_residual: ufl.core.expr.Expr, neumann: ufl.core.expr.Expr | None = None) -> Floats:
-    """Return the residual indicators of a second-order problem: h_K times the L2 norm of the strong residual on K.
+def residual(
+    uh: Function,
+    strong_residual: Expr,
+    neumann: Expr | Mapping[int, Expr] | None = None,
+    flux: Expr | None = None,
+) -> Floats:
+    """Return the residual indicators of a second-order problem.
 
-    The space is C1, so that no jumps across element edges arise.  h_K is the root of the area of the cell.  Near a
-    reentrant corner second derivatives are not square-integrable: there the residual grows with the level of the caps.
+    With h the root of the area of the cell K,
+
+        eta^2 = h^2 |strong residual|^2_K + h |residual of the Neumann condition|^2 + h / 2 |jump of the flux|^2
+
+    in L2 norms over K and over its edges on the boundary and inside. For -div(kappa grad(u)) = f with
+    kappa grad(u).n = g on the edges tagged 2, say ::
+
+        n, sigma = ufl.FacetNormal(msh), kappa * grad(uh)
+        estimate.residual(uh, f + div(sigma), neumann={2: g - dot(sigma, n)}, flux=sigma)
+
+    Where kappa is smooth the flux jumps only at the bicubic caps of extraordinary vertices, along the edges that leave
+    these: the space is C1 elsewhere. Jumps are small there, and `flux` may be left out. Where kappa jumps it may not.
+
+    Near a reentrant corner second derivatives are not square-integrable: there the residual grows with the level of the
+    caps.
 
     Args:
         uh: The approximation; the indicators belong to its cells.
         strong_residual: UFL expression in uh, e.g. f + div(grad(uh)).
-        neumann: Not supported yet; the residual of a Neumann condition.
+        neumann: Likewise on the boundary, where no values are prescribed: on all of it, or one for each edge tag.
+        flux: The vector (of a system: the tensor) whose normal part must not jump.
 
     Returns:
         Shape (num_cells,), local.
 
     Raises:
-        NotImplementedError: If `neumann` is given.
+        ValueError: If an expression has functions on finer cells, or an edge tag is unknown.
     """
-    if neumann is not None:
-        raise NotImplementedError("boundary integrals are not supported yet; leave out `neumann`")
     V = uh.function_space
-    squares = _over_cells(V, ufl.inner(strong_residual, strong_residual))
-    return np.sqrt(_over_cells(V, ufl.as_ufl(1.0)) * np.maximum(squares, 0.0))
+    h = np.sqrt(_over_cells(V, ufl.as_ufl(1.0)))
+    squares = h**2 * _over_cells(V, _square(strong_residual))
+    conditions = neumann.items() if isinstance(neumann, Mapping) else [("everywhere", neumann)]
+    for tag, condition in conditions:
+        if condition is not None:
+            squares += h * _over_cells(V, _square(condition), ufl.ds(tag))
+    if flux is not None:
+        jump = ufl.jump(flux, ufl.FacetNormal(V.mesh.ufl_domain()))
+        squares += h * _over_cells(V, _square(jump), ufl.dS)  # which counts for both cells by half
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
+def _square(value: Expr) -> Expr:
+    return ufl.inner(value, value)
 
 
 def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
@@ -97,7 +127,7 @@ def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
     Args:
         uh: The approximation; the indicators belong to its cells.
         a: Bilinear form in trial and test functions of the space of uh.
-        L: Linear form in a test function of that space. Boundary integrals of v do not see bubbles: leave them out.
+        L: Linear form in a test function of that space. Bubbles do not see integrals over edges.
 
     Returns:
         Shape (num_cells,), local.
@@ -151,7 +181,7 @@ def norm(V: FunctionSpace, eta: Floats) -> float:
     return float(np.sqrt(np.sum(np.asarray(eta) ** 2)))
 
 
-def _tangential(V: FunctionSpace, gradient: ufl.core.expr.Expr) -> ufl.core.expr.Expr:
+def _tangential(V: FunctionSpace, gradient: Expr) -> Expr:
     """Return the part of a gradient that is tangential to the surface.
 
     That of a THCCS function is tangential already, but UFL's gradient of an expression in the spatial coordinate is the
@@ -163,13 +193,13 @@ def _tangential(V: FunctionSpace, gradient: ufl.core.expr.Expr) -> ufl.core.expr
     return ufl.dot(gradient, ufl.Jacobian(domain) * ufl.JacobianInverse(domain))  # J times its pseudo-inverse
 
 
-def _over_cells(V: FunctionSpace, density: ufl.core.expr.Expr) -> Floats:
-    """Return the integral of a density over each cell of V, shape (num_cells,).
+def _over_cells(V: FunctionSpace, density: Expr, measure: ufl.Measure = ufl.dx) -> Floats:
+    """Return the integral of a density over each cell of V, or its edges, shape (num_cells,).
 
     Raises:
         ValueError: If the density has functions on finer cells than those of V.
     """
-    compiled = form(density * ufl.dx(domain=V.mesh.ufl_domain()), quadrature_degree=QUADRATURE_DEGREE, on=V)
+    compiled = form(density * measure(domain=V.mesh.ufl_domain()), quadrature_degree=QUADRATURE_DEGREE, on=V)
     if compiled.cells is not V.integration_cells:
         raise ValueError("the expression has functions on a refinement of the cells that indicators are wanted for")
     return assemble_cells(compiled)

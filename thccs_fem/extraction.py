@@ -26,7 +26,7 @@ from thccs_fem.limit import evaluate_patches
 from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at
 from thccs_fem.subdivision import Bools, Ints
 
-__all__ = ["Batch", "Cells", "evaluate_pieces", "extract"]
+__all__ = ["Batch", "Cells", "Rows", "evaluate_pieces", "extract"]
 
 WIDTH = 8  # operators are padded to a multiple of this many columns
 
@@ -150,6 +150,20 @@ class Cells:
             value.append(operators[i, j, k])
         entries = (np.concatenate(value), (np.concatenate(row), np.concatenate(column)))
         return sp.csr_array(entries, shape=(16 * pieces.size, self.num_dofs))
+
+    @cached_property
+    def cell_dofs(self) -> tuple[Ints, Ints]:
+        """Offsets, shape (num_cells + 1,), and the dofs of each cell, in the order of its row in its batch."""
+        cells = np.concatenate([batch.cells for batch in self.batches])
+        sizes = np.zeros(self.num_cells, dtype=np.int32)
+        sizes[cells] = np.concatenate([np.count_nonzero(batch.dofs >= 0, axis=1) for batch in self.batches])
+        offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+        dofs = np.zeros(offsets[-1], dtype=np.int32)
+        for batch in self.batches:
+            place = offsets[batch.cells][:, None] + np.arange(batch.dofs.shape[1], dtype=np.int32)
+            used = batch.dofs >= 0
+            dofs[place[used]] = batch.dofs[used]
+        return offsets, dofs
 
     @property
     def tag(self) -> Ints:
@@ -390,7 +404,7 @@ def _general_batches(
     if not pieces.size:
         return [], []
     cells, first, count = (a.astype(np.int32) for a in np.unique(cell, return_index=True, return_counts=True))
-    rows = _Rows(16 * np.append(first, np.int32(pieces.size)), nodes.ravel(), coefficients)
+    rows = Rows(16 * np.append(first, np.int32(pieces.size)), nodes.ravel(), coefficients)
     offsets, dofs = rows.columns()
     size = np.diff(offsets)
     width = -(-size // WIDTH) * WIDTH
@@ -417,7 +431,7 @@ def _general_batches(
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class Rows:
     """Rows of a matrix, cell by cell, for the loops of kernels.c.
 
     Attributes:

@@ -1,4 +1,4 @@
-"""Control meshes made by code: closed surfaces, planar domains and the models of Wei et al. (2015).
+"""Control meshes made by code: closed surfaces, shells, planar domains and the models of Wei et al. (2015).
 
 Most meshes are drawn as *blocks*: arrays of points of shape (rows, columns, gdim) whose cells are
 quads. `_joined` glues blocks where their points coincide. Vertices are numbered block by block and
@@ -6,7 +6,8 @@ row by row, faces likewise, so that neighbours are near in memory. Faces of plan
 counter-clockwise, those of closed surfaces have their normals outward.
 
 Vertices are control points: where a surface or a rim is curved, the limit lies off them, nearer by
-a factor of four with each doubling of the counts.
+a factor of four with each doubling of the counts. `interpolated` moves them so that it passes
+through where they were.
 """
 
 import itertools
@@ -22,18 +23,24 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import KDTree
 
+from thccs_fem.bezier import VERTEX_PLACE, bezier_masks
+from thccs_fem.boundary import Boundary
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.subdivision import subdivided
+from thccs_fem.subdivision import control_level, subdivided
 
 __all__ = [
     "cube_sphere",
+    "cylinder",
     "disc",
     "genus3",
+    "hemisphere",
     "implicit_surface",
+    "interpolated",
     "l_domain",
     "l_domain1",
     "l_domain2",
     "rectangle",
+    "spherical_zone",
     "torus",
     "wheel",
 ]
@@ -314,6 +321,182 @@ def _smoothed(vertices: Floats, quads: Ints, times: int) -> Floats:
         for step in SMOOTHING_STEPS:
             vertices = vertices + step * (mean @ vertices - vertices)
     return vertices
+
+
+# Shells: surfaces with rims
+
+
+def cylinder(
+    shape: Sequence[int],
+    R: float = 1.0,
+    length: float = 1.0,
+    angle: float = 2.0 * math.pi,
+    *,
+    rim: float = 1.0,
+    comm: Any = None,
+) -> ControlMesh:
+    """Make a circular cylinder around the z axis without lids, or a strip of it along the axis.
+
+    The vertices lie on the cylinder, from z = -length / 2 to length / 2 and from polar angle -angle / 2
+    to angle / 2: the middle of a strip is in the direction of x. Faces are numbered row by row along z;
+    u of a face runs around the axis, v along it, normals are outward.
+
+    A crease boundary does not bend across its edges: at the straight edges of a strip the limit surface
+    is flat, and the width of the faces there says how far.
+
+    Args:
+        shape: Faces around the axis and along it (n, m), one or more each, three or more around a
+            closed cylinder.
+        R: Radius.
+        length: Length along the axis.
+        angle: Angle of the strip, at most 2 pi: a closed cylinder.
+        rim: Width of the faces at the straight edges of a strip compared to faces that are all equal,
+            from above 0 to 1: those in between are wider towards the middle.
+        comm: MPI communicator of the mesh.
+
+    Raises:
+        TypeError: The shape is not two integers.
+        ValueError: A count, a length or a share is too small or too large.
+
+    >>> cylinder((8, 2)).boundary_loops[0].size, cylinder((8, 2), angle=1.0).num_vertices
+    (8, 27)
+    """
+    n, m = _counts("shape", shape, size=2, minimum=1)
+    if not (0 < R < math.inf and 0 < length < math.inf and 0 < angle <= 2.0 * math.pi):
+        raise ValueError(
+            f"R = {R}, length = {length} and angle = {angle}: expected positive numbers, an angle of at most 2 pi"
+        )
+    if angle == 2.0 * math.pi:
+        _check_count("shape[0] of a closed cylinder", n, minimum=3)
+        if rim != 1.0:
+            raise ValueError(f"rim is {rim}, but a closed cylinder has no straight edges: leave it out")
+    around = angle * (_graded(n, rim) - 0.5)
+    z = length * (np.linspace(0.0, 1.0, m + 1) - 0.5)
+    points = _lattice(around, z)
+    block = np.stack([R * np.cos(points[..., 0]), R * np.sin(points[..., 0]), points[..., 1]], axis=-1)
+    return ControlMesh(*_joined([block]), comm=comm)
+
+
+def spherical_zone(
+    shape: Sequence[int],
+    R: float = 1.0,
+    polar: Sequence[float] = (math.pi / 10, math.pi / 2),
+    *,
+    rim: float = 1.0,
+    comm: Any = None,
+) -> ControlMesh:
+    """Make the part of a sphere between two circles of latitude: by default half of it, with a hole of 18 degrees.
+
+    The vertices lie on the sphere around the origin, the first of each row in the half plane of the x and
+    z axes. Faces are numbered row by row from the lower circle up; u of a face runs around the z axis, v
+    up, normals are outward.
+
+    Args:
+        shape: Faces around the axis and along a meridian (n, m), three and one or more.
+        R: Radius.
+        polar: Angles of the upper and of the lower circle from the z axis, between 0 and pi.
+        rim: Height of the faces at both rims compared to faces that are all equal, as for `cylinder`.
+        comm: MPI communicator of the mesh.
+
+    Raises:
+        TypeError: The shape is not two integers.
+        ValueError: A count, an angle, the radius or the share is too small or too large.
+
+    >>> [loop.size for loop in spherical_zone((8, 2)).boundary_loops]
+    [8, 8]
+    """
+    n, m = _counts("shape", shape, size=2, minimum=1)
+    _check_count("shape[0]", n, minimum=3)
+    if len(polar) != 2 or not (0 < R < math.inf and 0 < polar[0] < polar[1] < math.pi):
+        raise ValueError(f"R = {R} and polar = {polar}: expected 0 < R and two angles, 0 < upper < lower < pi")
+    upper, lower = polar
+    points = _lattice(2.0 * math.pi * np.linspace(0.0, 1.0, n + 1), lower + (upper - lower) * _graded(m, rim))
+    around, down = np.moveaxis(points, -1, 0)
+    block = R * np.stack([np.sin(down) * np.cos(around), np.sin(down) * np.sin(around), np.cos(down)], axis=-1)
+    return ControlMesh(*_joined([block]), comm=comm)
+
+
+# Where the sides of a cube meet, its lines have kinks, and the limit of points on the sphere has wiggles
+# there: the curvature of a thin shell feels these more than its extraordinary vertices. So many steps
+# towards the mean of the neighbours take the kinks off; more would gather faces at the top.
+HEMISPHERE_STEPS = 5
+
+
+def hemisphere(n: int, R: float = 1.0, *, comm: Any = None) -> ControlMesh:
+    """Make the upper half of a sphere from half a cube: four extraordinary vertices of valence 3, no pole.
+
+    The vertices lie on the sphere, 8 n of them at equal angles on the rim, the circle z = 0. Normals are
+    outward.
+
+    Args:
+        n: Faces along half an edge of the cube, one or more.
+        R: Radius.
+        comm: MPI communicator of the mesh.
+
+    Raises:
+        TypeError: n is not an integer.
+        ValueError: n is less than 1, or the radius is not positive.
+
+    >>> hemisphere(2).num_faces, hemisphere(2).boundary_loops[0].size
+    (48, 16)
+    """
+    _check_count("n", n, minimum=1)
+    if not 0 < R < math.inf:
+        raise ValueError(f"the radius is {R}: expected a positive number")
+    whole = cube_sphere(2 * n)
+    upper = whole.quads[whole.vertices[whole.quads, 2].min(axis=1) > -SAME_POINT]
+    used, corner = np.unique(upper, return_inverse=True)
+    mesh = ControlMesh(whole.vertices[used], corner.reshape(-1, 4))
+    a, b = mesh.edges.T
+    one_way = sp.csr_array((np.ones(a.size), (a, b)), shape=(used.size, used.size))
+    points = np.array(mesh.vertices)
+    inside = np.setdiff1d(np.arange(used.size), mesh.boundary_vertices)
+    for _ in range(HEMISPHERE_STEPS):
+        sums = (one_way @ points + one_way.T @ points)[inside]
+        points[inside] = sums / np.linalg.norm(sums, axis=1, keepdims=True)
+    return ControlMesh(R * points, mesh.quads, comm=comm)
+
+
+def _graded(n: int, end: float) -> Floats:
+    """Return n + 1 numbers from 0 to 1, symmetric, with the slope `end` at both ends and no curvature there.
+
+    A cubic B-spline curve whose ends have no second derivative follows that smoothly.
+    """
+    if not 0 < end <= 1:
+        raise ValueError(f"rim is {end}: expected a share above 0, at most 1")
+    t = np.linspace(0.0, 1.0, n + 1)
+    return end * t + (1.0 - end) * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
+
+
+# Limits through given points
+
+
+def interpolated(mesh: ControlMesh) -> ControlMesh:
+    """Return the mesh whose limit surface passes through the vertices of a given one, each vertex going to its own.
+
+    The limit points of the vertices are sparse linear combinations of the vertices: one system is solved.
+    Between them the limit is near a smooth surface that the vertices lie on by the fourth order of the
+    size of the faces; by the second at rims across which the surface is curved, and where the lines of the
+    mesh have kinks.
+
+    Args:
+        mesh: A mesh of quads. Tags, creases and corners are kept.
+
+    Raises:
+        ValueError: A face is no quad.
+        NotImplementedError: The mesh has creases inside, or corners that are semi-sharp or inside.
+
+    >>> ring = interpolated(cylinder((12, 1)))
+    >>> round(float(np.hypot(*ring.vertices[0, :2])), 4)  # outside of the circle: 3 / (2 + cos(2 pi / 12))
+    1.0467
+    """
+    quads = mesh.quads
+    _, first = np.unique(quads, return_index=True)
+    faces, k = np.divmod(first.astype(np.int32), 4)
+    masks = bezier_masks(Boundary.of(control_level(mesh), "crease"), faces)
+    limits = sp.csr_array(masks[16 * np.arange(k.size) + VERTEX_PLACE[k]])
+    vertices = spsolve(limits.tocsc(), mesh.vertices)
+    return ControlMesh(vertices, quads, mesh.face_tags, mesh.edge_tags, mesh.creases, mesh.corners, comm=mesh.comm)
 
 
 # Planar domains

@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from typing import Self
 
 import numpy as np
@@ -199,11 +200,76 @@ class Hierarchy:
         Args:
             dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
         """
-        keys: list[Keys] = [*self.refined_keys, np.zeros(0, dtype=np.int64)]
-        for l, support in enumerate(self.support(dofs)):
-            keys[l] = np.union1d(keys[l], self.stages[l].level.keys[support])
-        if keys[0].size:
-            keys[0] = np.union1d(keys[0], self.root.keys[_dependent_faces(self.root)])
+        return self.remeshed(dofs, np.zeros(0, dtype=np.int64))
+
+    def coarsened(self, cells: npt.NDArray[np.integer]) -> Self:
+        """Return the hierarchy in which the given cells are coarsened by one level, where whole functions allow it.
+
+        A face of Omega^{l+1} is free if its four children are cells, and given. What is left of Omega^{l+1} is the
+        union of the supports without free faces, and for each other face that is not free one support more, that with
+        the fewest free faces. So cells that are not given stay (but the faces of level 0 that are refined along with
+        others go with the last of them), and ``refined(dofs)`` is undone when the cells that it made are given.
+
+        Args:
+            cells: Active elements, numbers in 0 .. number of cells, shape (n,).
+
+        Returns:
+            A coarsening of this hierarchy; this hierarchy itself if no face can go.
+        """
+        return self.remeshed(np.zeros(0, dtype=np.int64), cells)
+
+    def remeshed(self, dofs: npt.NDArray[np.integer], cells: npt.NDArray[np.integer]) -> Self:
+        """Return the hierarchy with supports of dofs `refined`, and cells `coarsened` where that undoes none of it.
+
+        Args:
+            dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
+            cells: Active elements, numbers in 0 .. number of cells, shape (m,).
+        """
+        stages = self.stages[: self.num_levels]
+        supports = self.support(dofs)
+        spare = [marks & ~support for marks, support in zip(self._marks_of(cells), supports, strict=True)]
+        keys = []
+        for l, (stage, support) in enumerate(zip(stages, supports, strict=True)):
+            refined = stage.refined | support
+            free = _with_all_children(stage, spare[l + 1]) & ~support if l + 1 < len(stages) else ~refined
+            along = _dependent_faces(stage.level) if l == 0 else np.zeros_like(refined)
+            kept = refined & (~free | along)
+            cover = _cover(stage, kept & ~along, kept, refined)
+            keys.append(stage.level.keys[cover | (along & cover.any())])
+        if _same_keys(keys, self.refined_keys):
+            return self
+        return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
+
+    def _marks_of(self, cells: npt.NDArray[np.integer]) -> list[Bools]:
+        """Return marks of the given cells on the faces of each level."""
+        active = [stage.active_faces for stage in self.stages[: self.num_levels]]
+        marked = np.zeros(sum(faces.size for faces in active), dtype=bool)
+        marked[cells] = True
+        result, first = [], 0
+        for stage, faces in zip(self.stages, active, strict=False):
+            marks = np.zeros(stage.level.num_faces, dtype=bool)
+            marks[faces] = marked[first : first + faces.size]
+            result.append(marks)
+            first += faces.size
+        return result
+
+    def common_refinement(self, other: Hierarchy) -> Self:
+        """Return the coarsest hierarchy that refines this one and another one.
+
+        Raises:
+            ValueError: If the other has another control mesh, boundary rule or least cap level.
+        """
+        if self.mesh is not other.mesh or (self.rule, self.cap_level) != (other.rule, other.cap_level):
+            raise ValueError(
+                "the hierarchies have no common refinement: both must be on the same control mesh, with the same "
+                f"boundary rule and the same cap level; they have {self.rule!r}, {self.cap_level} and "
+                f"{other.rule!r}, {other.cap_level}" + (" on two control meshes" if self.mesh is not other.mesh else "")
+            )
+        nothing = np.zeros(0, dtype=np.int64)
+        pairs = zip_longest(self.refined_keys, other.refined_keys, fillvalue=nothing)
+        keys = [np.union1d(ours, theirs) for ours, theirs in pairs]
+        if _same_keys(keys, self.refined_keys):
+            return self
         return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
 
     def with_caps_at(self, cap_level: int) -> Self:
@@ -270,6 +336,12 @@ def _is_dependent(root: Level) -> bool:
 def _as_level_zero(level: Level) -> Level:
     """Return a first subdivision as level 0 of a hierarchy."""
     return replace(level, number=0, control_vertex=np.arange(level.num_vertices, dtype=np.int32))
+
+
+def _same_keys(keys: Sequence[Keys], others: Sequence[Keys]) -> bool:
+    """Return whether two sequences hold the same keys, empty ones at the end aside."""
+    nothing = np.zeros(0, dtype=np.int64)
+    return all(np.array_equal(k, o) for k, o in zip_longest(keys, others, fillvalue=nothing))
 
 
 def _check_cap_level(cap_level: int) -> None:
@@ -360,6 +432,64 @@ def _support(boundary: Boundary, functions: Bools) -> Bools:
     level = boundary.level
     vertices, traces = np.split(functions, [level.num_vertices])
     return neighbourhood(level, level.touching(vertices)) | support_of_traces(boundary, traces)
+
+
+def _with_all_children(stage: Stage, children: Bools) -> Bools:
+    """Return the refined faces all of whose children, faces of the next level, are marked, shape (num_faces,)."""
+    marks = np.zeros(stage.level.num_faces, dtype=bool)
+    assert stage.step is not None  # there is a next level
+    first = stage.step.first_child[stage.refined]
+    marks[stage.refined] = children[first[:, None] + np.arange(4)].all(axis=1)
+    return marks
+
+
+def _cover(stage: Stage, wanted: Bools, kept: Bools, most: Bools) -> Bools:
+    """Return a small union of supports that holds the wanted faces and lies in the faces `most`, shape (num_faces,).
+
+    All supports that lie in the faces to be kept, wanted or not; then, for each face that is left, the one that adds
+    the fewest faces; then traces, for faces at the rim that only they can have brought.  (The smallest union of all
+    would be a set cover, which is NP-hard to find.)
+    """
+    if np.array_equal(kept, most):  # refinement alone
+        return most
+    boundary = stage.boundary
+    covered = _support(boundary, stage.selected & ~_meeting(boundary, ~kept))
+    left = wanted & ~covered
+    if not left.any():
+        return covered
+    candidates = stage.selected & ~_meeting(boundary, ~most)
+    vertices, traces = np.split(candidates, [stage.level.num_vertices])
+    chosen = np.zeros(boundary.num_functions, dtype=bool)
+    chosen[_cheapest(stage.level, np.flatnonzero(vertices), left, ~kept & ~covered)] = True
+    covered = covered | _support(boundary, chosen)
+    left = left & ~covered
+    chosen[stage.level.num_vertices :] = traces & traces_meeting(boundary, left)
+    return covered | _support(boundary, chosen)
+
+
+def _cheapest(level: Level, vertices: npt.NDArray[np.integer], left: Bools, unwanted: Bools) -> Ints:
+    """Return, for each face that is left, the best of the vertices whose function has it in its support.
+
+    The best has the fewest unwanted faces in its support; of these, the most that are left; of these, the first vertex.
+
+    Returns:
+        Vertices, ascending, each once; none for a face in no support.
+    """
+    corners = sp.csr_array(
+        (np.ones(level.vertices.size, dtype=np.int32), level.vertices, level.offsets),
+        shape=(level.num_faces, level.num_vertices),
+    )
+    around = sp.csr_array(corners @ corners.T)
+    own = sp.csc_array(corners)[:, vertices]
+    pairs = sp.coo_array(around @ own)  # face, function: the face is in the support
+    face, function = pairs.coords
+    cost = np.bincount(function[unwanted[face]], minlength=vertices.size)
+    gain = np.bincount(function[left[face]], minlength=vertices.size)
+    order = np.lexsort((-gain, cost))
+    rank = np.argsort(order)
+    best = np.full(level.num_faces, order.size)
+    np.minimum.at(best, face[left[face]], rank[function[left[face]]])
+    return np.unique(vertices[order[best[left & (best < order.size)]]]).astype(np.int32)
 
 
 def _coefficients(stages: Sequence[Stage], of: Sequence[Stage]) -> list[sp.csr_array]:

@@ -11,15 +11,24 @@ enum { LOCAL = 16 }; /* functions on a piece */
 
 /* ---- Assembly -------------------------------------------------------------------------------------------------- */
 
-/* Space for one cell at a time, in one allocation. */
+/* Loops are over cells, whose pieces have 16 functions, and over facets, where two pieces meet that have 32 together.
+   Code for both is inline, and called with constants: that makes loops of their own. */
+#define INLINE static inline __attribute__((always_inline))
+
+/* Of FFCx's reference square, sides y = 0 of the first piece and y = 1 of the second, and that both run alike: pieces
+   of facets are turned that way. Of no interest to kernels of cells. */
+static const int FACETS[2] = {0, 3};
+static const uint8_t PERMUTATIONS[2] = {0, 0};
+
+/* Space for one cell or facet at a time, in one allocation. */
 typedef struct {
-  double points[3 * LOCAL]; /* the third coordinate stays 0 in the plane */
-  double *cell_coefficients;  /* (width, block size) of each coefficient in turn */
-  double *piece_coefficients; /* (16, block size) of each coefficient in turn */
+  double points[2 * 3 * LOCAL]; /* the third coordinate stays 0 in the plane */
+  double *cell_coefficients;    /* (width, block size) of each coefficient in turn, (sides, block size) of cellwise ones */
+  double *piece_coefficients;   /* (local, block size) of each coefficient in turn, again but for cellwise ones */
   double *piece_tensor;
   double *cell_tensor;
-  double *block;   /* (16, 16): one pair of components of piece_tensor, A */
-  double *half;    /* (16, width): A^T C */
+  double *block;   /* (local, local): one pair of components of piece_tensor, A */
+  double *half;    /* (local, width): A^T C */
   double *product; /* (width, width): C^T A C */
 } workspace;
 
@@ -27,12 +36,12 @@ typedef struct {
 static void *make_workspace(workspace *work, const thccs_batch *batch, const thccs_integral *integral,
                             int64_t components)
 {
+  const int64_t w = batch->width, local = LOCAL * batch->sides;
   int64_t block_sizes = 0;
   for (int32_t i = 0; i < integral->num_coefficients; ++i)
-    block_sizes += integral->block_sizes[i];
-  const int64_t w = batch->width;
-  const int64_t sizes[] = {w * block_sizes, LOCAL * block_sizes, LOCAL * LOCAL * components, w * w * components,
-                           LOCAL * LOCAL, LOCAL * w, w * w};
+    block_sizes += integral->coefficients[i].block_size;
+  const int64_t sizes[] = {w * block_sizes, local * block_sizes, local * local * components, w * w * components,
+                           local * local, local * w, w * w};
   int64_t total = 0;
   for (int i = 0; i < 7; ++i)
     total += sizes[i];
@@ -51,28 +60,37 @@ static void *make_workspace(workspace *work, const thccs_batch *batch, const thc
   return memory;
 }
 
-/* Values of the coefficients at the dofs of a cell. */
-static void gather_coefficients(const thccs_integral *integral, int32_t width, const int32_t *dofs, double *out)
+/* Values of the coefficients at the dofs of a cell or facet, or at its cells. */
+INLINE void gather_coefficients(int sides, const thccs_batch *batch, const thccs_integral *integral, int32_t k,
+                                double *out)
 {
   for (int32_t i = 0; i < integral->num_coefficients; ++i) {
-    const int32_t bs = integral->block_sizes[i];
-    const double *values = integral->coefficients[i];
-    if (values)
-      for (int32_t j = 0; j < width; ++j)
+    const thccs_coefficient *w = integral->coefficients + i;
+    const int32_t bs = w->block_size, n = w->is_cellwise ? sides : batch->width;
+    const int32_t *from = w->is_cellwise ? batch->cells + (int64_t)sides * k : batch->dofs + (int64_t)batch->width * k;
+    if (w->values)
+      for (int32_t j = 0; j < n; ++j)
         for (int32_t c = 0; c < bs; ++c)
-          out[j * bs + c] = dofs[j] < 0 ? 0.0 : values[(int64_t)bs * dofs[j] + c];
-    out += (int64_t)width * bs;
+          out[j * bs + c] = from[j] < 0 ? 0.0 : w->values[(int64_t)bs * from[j] + c];
+    out += (int64_t)n * bs;
   }
 }
 
 /* Their local B-spline coefficients on a piece: operator @ values. */
-static void extract_coefficients(const thccs_integral *integral, int32_t width, const double *operator,
+INLINE void extract_coefficients(int sides, const thccs_integral *integral, int32_t width, const double *operator,
                                  const double *in, double *out)
 {
   for (int32_t i = 0; i < integral->num_coefficients; ++i) {
-    const int32_t bs = integral->block_sizes[i];
-    if (integral->coefficients[i])
-      for (int32_t r = 0; r < LOCAL; ++r)
+    const thccs_coefficient *w = integral->coefficients + i;
+    const int32_t bs = w->block_size;
+    if (w->is_cellwise) {
+      memcpy(out, in, sides * bs * sizeof(double));
+      in += sides * bs;
+      out += sides * bs;
+      continue;
+    }
+    if (w->values)
+      for (int32_t r = 0; r < sides * LOCAL; ++r)
         for (int32_t c = 0; c < bs; ++c) {
           double sum = 0.0;
           for (int32_t j = 0; j < width; ++j)
@@ -80,26 +98,27 @@ static void extract_coefficients(const thccs_integral *integral, int32_t width, 
           out[r * bs + c] = sum;
         }
     in += (int64_t)width * bs;
-    out += LOCAL * (int64_t)bs;
+    out += (int64_t)sides * LOCAL * bs;
   }
 }
 
-/* work->piece_tensor = the integral over a piece. The coefficients of its cell have been gathered. */
-static void integrate_piece(const thccs_batch *batch, const thccs_integral *integral, int64_t piece, int64_t size,
-                            workspace *work)
+/* work->piece_tensor = the integral over a piece or facet. The coefficients of its cell have been gathered. */
+INLINE void integrate_piece(int sides, const thccs_batch *batch, const thccs_integral *integral, int64_t piece,
+                            int64_t size, workspace *work)
 {
-  const int32_t *nodes = batch->nodes + LOCAL * piece;
-  for (int i = 0; i < LOCAL; ++i)
+  const int local = sides * LOCAL;
+  const int32_t *nodes = batch->nodes + local * piece;
+  for (int i = 0; i < local; ++i)
     for (int c = 0; c < batch->gdim; ++c)
       work->points[3 * i + c] = batch->points[(int64_t)batch->gdim * nodes[i] + c];
   const double *coefficients = work->cell_coefficients;
   if (batch->operators && integral->num_coefficients) {
-    extract_coefficients(integral, batch->width, batch->operators + LOCAL * batch->width * piece, coefficients,
+    extract_coefficients(sides, integral, batch->width, batch->operators + local * batch->width * piece, coefficients,
                          work->piece_coefficients);
     coefficients = work->piece_coefficients;
   }
   memset(work->piece_tensor, 0, size * sizeof(double));
-  integral->kernel(work->piece_tensor, coefficients, integral->constants, work->points, NULL, NULL, NULL);
+  integral->kernel(work->piece_tensor, coefficients, integral->constants, work->points, FACETS, PERMUTATIONS, NULL);
 }
 
 static int32_t chosen(const thccs_integral *integral, int32_t i)
@@ -107,7 +126,7 @@ static int32_t chosen(const thccs_integral *integral, int32_t i)
   return integral->cells ? integral->cells[i] : i;
 }
 
-int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values)
+INLINE int assemble_cells(int sides, const thccs_batch *batch, const thccs_integral *integral, double *values)
 {
   workspace work;
   void *memory = make_workspace(&work, batch, integral, 1);
@@ -115,38 +134,44 @@ int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integra
     return -1;
   for (int32_t i = 0; i < integral->num_cells; ++i) {
     const int32_t k = chosen(integral, i);
-    gather_coefficients(integral, batch->width, batch->dofs + (int64_t)batch->width * k, work.cell_coefficients);
+    gather_coefficients(sides, batch, integral, k, work.cell_coefficients);
     for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
-      integrate_piece(batch, integral, piece, 1, &work);
-      values[batch->cells[k]] += work.piece_tensor[0];
+      integrate_piece(sides, batch, integral, piece, 1, &work);
+      for (int s = 0; s < sides; ++s)
+        values[batch->cells[(int64_t)sides * k + s]] += work.piece_tensor[0] / sides;
     }
   }
   free(memory);
   return 0;
 }
 
-int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
-                          double *values)
+int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values)
+{
+  return batch->sides == 1 ? assemble_cells(1, batch, integral, values) : assemble_cells(2, batch, integral, values);
+}
+
+INLINE int assemble_vector(int sides, const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                           double *values)
 {
   workspace work;
   void *memory = make_workspace(&work, batch, integral, block_size);
   if (!memory)
     return -1;
-  const int32_t bs = block_size, width = batch->width;
+  const int32_t bs = block_size, width = batch->width, local = sides * LOCAL;
   for (int32_t i = 0; i < integral->num_cells; ++i) {
     const int32_t k = chosen(integral, i);
     const int32_t *dofs = batch->dofs + (int64_t)width * k;
-    gather_coefficients(integral, width, dofs, work.cell_coefficients);
+    gather_coefficients(sides, batch, integral, k, work.cell_coefficients);
     const double *tensor = work.piece_tensor;
     if (batch->operators) {
       tensor = work.cell_tensor;
       memset(work.cell_tensor, 0, width * bs * sizeof(double));
     }
     for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
-      integrate_piece(batch, integral, piece, LOCAL * bs, &work);
+      integrate_piece(sides, batch, integral, piece, local * bs, &work);
       if (batch->operators) {
-        const double *operator = batch->operators + LOCAL * width * piece;
-        for (int32_t r = 0; r < LOCAL; ++r)
+        const double *operator = batch->operators + local * width * piece;
+        for (int32_t r = 0; r < local; ++r)
           for (int32_t j = 0; j < width; ++j)
             for (int32_t c = 0; c < bs; ++c)
               work.cell_tensor[j * bs + c] += operator[r * width + j] * work.piece_tensor[r * bs + c];
@@ -160,6 +185,13 @@ int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integr
   return 0;
 }
 
+int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
+                          double *values)
+{
+  return batch->sides == 1 ? assemble_vector(1, batch, integral, block_size, values)
+                           : assemble_vector(2, batch, integral, block_size, values);
+}
+
 /* As many doubles as one register holds: wider vectors are legal C but go through memory. */
 #if defined(__AVX512F__)
 enum { LANES = 8 };
@@ -170,8 +202,8 @@ enum { LANES = 2 };
 #endif
 typedef double vector __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
 
-/* out (m, n) += x^T y with x (16, m) and y (16, n), m and n multiples of 8: eight registers of sums at a time. */
-static void add_product(int32_t m, int32_t n, const double *restrict x, const double *restrict y,
+/* out (m, n) += x^T y with x (depth, m) and y (depth, n), m and n multiples of 8: eight registers of sums at a time. */
+INLINE void add_product(int depth, int32_t m, int32_t n, const double *restrict x, const double *restrict y,
                         double *restrict out)
 {
   for (int32_t j = 0; j < n; j += LANES)
@@ -179,7 +211,7 @@ static void add_product(int32_t m, int32_t n, const double *restrict x, const do
       vector sum[8];
       for (int a = 0; a < 8; ++a)
         sum[a] = *(const vector *)(out + (i + a) * n + j);
-      for (int k = 0; k < LOCAL; ++k) {
+      for (int k = 0; k < depth; ++k) {
         const vector right = *(const vector *)(y + k * n + j);
         for (int a = 0; a < 8; ++a)
           sum[a] += x[k * m + i + a] * right;
@@ -190,23 +222,24 @@ static void add_product(int32_t m, int32_t n, const double *restrict x, const do
 }
 
 /* work->cell_tensor (width, rows, width, columns) += C^T A C for each pair of components of the piece's A. */
-static void add_extracted(int32_t rows, int32_t columns, int32_t width, const double *operator, workspace *work)
+INLINE void add_extracted(int local, int32_t rows, int32_t columns, int32_t width, const double *operator,
+                          workspace *work)
 {
   for (int32_t r = 0; r < rows; ++r)
     for (int32_t c = 0; c < columns; ++c) {
       const double *block = work->piece_tensor;
       double *product = work->cell_tensor;
       if (rows * columns > 1) {
-        for (int32_t i = 0; i < LOCAL; ++i)
-          for (int32_t j = 0; j < LOCAL; ++j)
-            work->block[LOCAL * i + j] = work->piece_tensor[((i * rows + r) * LOCAL + j) * columns + c];
+        for (int32_t i = 0; i < local; ++i)
+          for (int32_t j = 0; j < local; ++j)
+            work->block[local * i + j] = work->piece_tensor[((i * rows + r) * local + j) * columns + c];
         memset(work->product, 0, width * width * sizeof(double));
         block = work->block;
         product = work->product;
       }
-      memset(work->half, 0, LOCAL * width * sizeof(double));
-      add_product(LOCAL, width, block, operator, work->half);
-      add_product(width, width, work->half, operator, product);
+      memset(work->half, 0, local * width * sizeof(double));
+      add_product(local, local, width, block, operator, work->half);
+      add_product(local, width, width, work->half, operator, product);
       if (rows * columns > 1)
         for (int32_t i = 0; i < width; ++i)
           for (int32_t j = 0; j < width; ++j)
@@ -221,11 +254,9 @@ typedef struct {
   int32_t position_size;
 } target;
 
-/* values += tensor (width, rows, width, columns), of which the first n functions are used. Inline, so that constants
-   among the arguments make loops of their own. */
-static inline __attribute__((always_inline)) void add_rows(int32_t n, int32_t width, const int32_t *dofs,
-                                                           int32_t rows, int32_t columns, target into,
-                                                           const double *restrict tensor, double *restrict values)
+/* values += tensor (width, rows, width, columns), of which the first n functions are used. */
+INLINE void add_rows(int32_t n, int32_t width, const int32_t *dofs, int32_t rows, int32_t columns, target into,
+                     const double *restrict tensor, double *restrict values)
 {
   const uint8_t *narrow = into.positions;
   const uint16_t *wide = into.positions;
@@ -242,12 +273,12 @@ static inline __attribute__((always_inline)) void add_rows(int32_t n, int32_t wi
   }
 }
 
-int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
-                          const int32_t *indptr, const int64_t *starts, int32_t position_size,
-                          const void *positions, double *values)
+INLINE int assemble_matrix(int sides, const thccs_batch *batch, const thccs_integral *integral, int32_t rows,
+                           int32_t columns, const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                           const void *positions, double *values)
 {
   workspace work;
-  const int32_t width = batch->width, components = rows * columns;
+  const int32_t width = batch->width, components = rows * columns, local = sides * LOCAL;
   void *memory = make_workspace(&work, batch, integral, components);
   if (!memory)
     return -1;
@@ -255,13 +286,13 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
   for (int32_t i = 0; i < integral->num_cells; ++i) {
     const int32_t k = chosen(integral, i);
     const int32_t *dofs = batch->dofs + (int64_t)width * k;
-    gather_coefficients(integral, width, dofs, work.cell_coefficients);
+    gather_coefficients(sides, batch, integral, k, work.cell_coefficients);
     if (batch->operators)
       memset(work.cell_tensor, 0, (int64_t)width * width * components * sizeof(double));
     for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
-      integrate_piece(batch, integral, piece, LOCAL * LOCAL * components, &work);
+      integrate_piece(sides, batch, integral, piece, local * local * components, &work);
       if (batch->operators)
-        add_extracted(rows, columns, width, batch->operators + LOCAL * width * piece, &work);
+        add_extracted(local, rows, columns, width, batch->operators + local * width * piece, &work);
     }
     int32_t n = 0;
     while (n < width && dofs[n] >= 0)
@@ -279,6 +310,15 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
   }
   free(memory);
   return 0;
+}
+
+int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
+                          const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                          const void *positions, double *values)
+{
+  return batch->sides == 1
+             ? assemble_matrix(1, batch, integral, rows, columns, indptr, starts, position_size, positions, values)
+             : assemble_matrix(2, batch, integral, rows, columns, indptr, starts, position_size, positions, values);
 }
 
 /* ---- Local problems -------------------------------------------------------------------------------------------- */
@@ -307,10 +347,8 @@ static void bubbles_on_piece(const double *origin, const double *axes, double *b
 
 /* residual (4, bs) += b^T tensor, and with coefficients (16, bs) for which tensor is a matrix: matrix (4, bs, 4, bs)
    += b^T tensor b and residual -= b^T tensor coefficients. */
-static inline __attribute__((always_inline)) void add_on_bubbles(int32_t bs, const double *restrict b,
-                                                                 const double *restrict tensor,
-                                                                 const double *restrict coefficients,
-                                                                 double *restrict matrix, double *restrict residual)
+INLINE void add_on_bubbles(int32_t bs, const double *restrict b, const double *restrict tensor,
+                           const double *restrict coefficients, double *restrict matrix, double *restrict residual)
 {
   for (int32_t i = 0; i < LOCAL; ++i)
     for (int32_t r = 0; r < bs; ++r) {
@@ -348,12 +386,12 @@ int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *in
   for (int32_t i = 0; i < integral->num_cells; ++i) {
     const int32_t k = chosen(integral, i);
     double *matrix = matrices + n * n * batch->cells[k], *residual = residuals + n * batch->cells[k];
-    gather_coefficients(integral, batch->width, batch->dofs + (int64_t)batch->width * k, work.cell_coefficients);
+    gather_coefficients(1, batch, integral, k, work.cell_coefficients);
     for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
       double b[LOCAL * BUBBLES];
       const double *c = coefficients ? coefficients + LOCAL * bs * piece : NULL;
       bubbles_on_piece(origins + 2 * piece, axes + 4 * piece, b);
-      integrate_piece(batch, integral, piece, LOCAL * bs * columns, &work);
+      integrate_piece(1, batch, integral, piece, LOCAL * bs * columns, &work);
       if (bs == 1)
         add_on_bubbles(1, b, work.piece_tensor, c, matrix, residual);
       else
@@ -499,11 +537,9 @@ void thccs_positions(int32_t num_dofs, const int32_t *restrict cell_offsets, con
 
 void thccs_tabulate(thccs_kernel *kernel, int32_t n, int32_t num_values, int32_t num_coefficients,
                     const double *coefficients, const double *constants, const double *points, double *values) {
-  const int entity[2] = {0, 0};
-  const uint8_t permutation[2] = {0, 0};
   for (int64_t k = 0; k < n; ++k)
-    kernel(values + k * num_values, coefficients + k * num_coefficients, constants, points + k * 48, entity,
-           permutation, NULL);
+    kernel(values + k * num_values, coefficients + k * num_coefficients, constants, points + k * 48, FACETS,
+           PERMUTATIONS, NULL);
 }
 
 /* ---- Evaluation ------------------------------------------------------------------------------------------------ */
@@ -521,10 +557,8 @@ static void bernstein(double t, double b[3][4])
 /* Number of derivatives along u and along v of each row of the result. */
 static const int ORDERS[6][2] = {{0, 0}, {1, 0}, {0, 1}, {2, 0}, {1, 1}, {0, 2}};
 
-static inline __attribute__((always_inline)) void evaluate_patches(int64_t n, const int32_t *patches,
-                                                                   const double *uv, int32_t size,
-                                                                   const double *restrict coefficients,
-                                                                   int rows, double *restrict out)
+INLINE void evaluate_patches(int64_t n, const int32_t *patches, const double *uv, int32_t size,
+                             const double *restrict coefficients, int rows, double *restrict out)
 {
   for (int64_t p = 0; p < n; ++p) {
     const double *restrict c = coefficients + (int64_t)LOCAL * size * patches[p];

@@ -1,36 +1,44 @@
 /* Declarations of kernels.c, for the C compiler and for cffi: plain C, no preprocessor. */
 
-/* Of FFCx: adds the integral over one piece to A. Arguments: A, coefficients, constants, control points (16, 3), and
-   three that only facets need. */
+/* Of FFCx: adds the integral over one piece to A, or that over the side where two meet. Arguments: A, coefficients,
+   constants, control points (16, 3) or (2, 16, 3), and three that tell which side of the pieces is meant. */
 typedef void thccs_kernel(double *, const double *, const double *, const double *, const int *, const uint8_t *,
                           void *);
 
-/* Cells of equal width (extraction.Batch), and the control points. */
+/* Cells of equal width (extraction.Batch), and the control points. Or facets: each is a cell of one piece, or two pieces
+   taken together (sides 2), turned so that kernels see it as side y = 0 of the first and y = 1 of the second. */
 typedef struct {
+  int32_t sides;           /* 1, or 2 for facets between cells; local = 16 * sides functions on a piece */
   int32_t width;           /* of the rows of dofs and operators, a multiple of 8 */
   int32_t gdim;
-  const int32_t *cells;    /* (n) cell numbers */
+  const int32_t *cells;    /* (n, sides) cell numbers */
   const int32_t *dofs;     /* (n, width) scalar dofs, -1 at the end of a row is padding */
   const int32_t *offsets;  /* (n + 1) pieces of the k-th cell: offsets[k] .. offsets[k + 1] */
-  const int32_t *nodes;    /* (pieces, 16) rows of points */
-  const double *operators; /* (pieces, 16, width), or NULL: identity, width 16 and one piece a cell */
+  const int32_t *nodes;    /* (pieces, local) rows of points */
+  const double *operators; /* (pieces, local, width), or NULL: identity, width 16 and one piece a cell */
   const double *points;    /* (nodes, gdim) */
 } thccs_batch;
+
+/* A function in a form. */
+typedef struct {
+  const double *values; /* block_size values a dof, or a cell; NULL: not used here */
+  int32_t block_size;
+  int32_t is_cellwise;  /* constant on each cell */
+} thccs_coefficient;
 
 /* What is integrated, and on which cells of the batch. */
 typedef struct {
   thccs_kernel *kernel;
   const double *constants;
   int32_t num_coefficients;
-  const int32_t *block_sizes;          /* (num_coefficients) */
-  const double *const *coefficients;   /* (num_coefficients) block_size values a dof; NULL: not used here */
+  const thccs_coefficient *coefficients; /* (num_coefficients) */
   int32_t num_cells;
-  const int32_t *cells;                /* (num_cells) positions in the batch, or NULL: 0 .. num_cells */
+  const int32_t *cells; /* (num_cells) positions in the batch, or NULL: 0 .. num_cells */
 } thccs_integral;
 
 /* These four return 0, or -1 when there is no memory. */
 
-/* values[cell] += integral over the cell. */
+/* values[cell] += integral over the cell, or half of that over the facet of two cells. */
 int thccs_assemble_cells(const thccs_batch *batch, const thccs_integral *integral, double *values);
 
 /* values[block_size * dof + component] += integral. */

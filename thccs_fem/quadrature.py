@@ -25,6 +25,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from thccs_fem import element
 from thccs_fem.extraction import Batch, Cells, extract
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.subdivision import Bools
@@ -35,9 +36,6 @@ Floats = npt.NDArray[np.float64]
 
 NUM_GAUSS = 4  # points along each side of an element
 DEPTH = 4  # cuts after which no Gauss point is left in a cap: they keep 0.069 from the sides, more than 2^-4
-
-# The monomials' coefficients, constant first, of the four uniform cubic B-splines on [0, 1], times 6.
-_TO_MONOMIALS_TIMES_6 = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 
 
 def paper_cells(hierarchy: Hierarchy) -> Cells:
@@ -55,11 +53,12 @@ def paper_cells(hierarchy: Hierarchy) -> Cells:
     pieces, points, corners, sides = [], [], [], []
     for batch, begin, end in zip(cells.batches, first[:-1], first[1:], strict=True):
         piece, centre, side = _gauss_points(batch, cells.piece_origin[begin:end], cells.piece_axes[begin:end])
-        restriction = _restriction(centre, side)
+        corner = centre - side[:, None] / 2.0
+        restriction = element.restrictions(corner, side[:, None, None] * np.eye(2))
         batches.append(_gauss_batch(batch, NUM_GAUSS**2 * sum(b.cells.size for b in batches), piece, restriction))
         points.append(restriction @ cells.piece_points[begin + piece])
         pieces.append(begin + piece)
-        corners.append(centre - side[:, None] / 2.0)
+        corners.append(corner)
         sides.append(side)
     origin, axes = (a[np.concatenate(pieces)] for a in (cells.piece_origin, cells.piece_axes))
     return replace(
@@ -105,23 +104,6 @@ def _gauss_points(batch: Batch, origin: Floats, axes: Floats) -> tuple[npt.NDArr
     piece, point = np.nonzero(((local > 0.0) & (local < 1.0)).all(axis=2))
     assert piece.size == weights.size * batch.cells.size, "a Gauss point lies on an edge of pieces, or in none"
     return piece, local[piece, point], np.sqrt(weights[point] / area[piece])
-
-
-def _restriction(centre: Floats, side: Floats) -> Floats:
-    """Return the matrices that take local B-spline coefficients of a polynomial to those on another square.
-
-    Args:
-        centre: Centres of the squares, shape (n, 2).
-        side: Their sides, shape (n,).
-
-    Returns:
-        Shape (n, 16, 16).
-    """
-    # Coefficient j of a cubic f is its polar form at the knots around it, f[j - 2, j - 1, j].
-    x, y, z = (centre[:, :, None] + side[:, None, None] * (np.arange(4) - shift - 0.5) for shift in (2, 1, 0))
-    polar = np.stack([np.ones_like(x), (x + y + z) / 3.0, (x * y + y * z + z * x) / 3.0, x * y * z], axis=-1)
-    along = polar @ (_TO_MONOMIALS_TIMES_6 / 6.0)
-    return np.einsum("njl,nik->njilk", along[:, 1], along[:, 0]).reshape(-1, 16, 16)
 
 
 @functools.cache

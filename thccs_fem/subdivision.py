@@ -33,6 +33,7 @@ __all__ = [
     "Step",
     "control_level",
     "neighbourhood",
+    "rim_distance",
     "subdivide",
     "subdivided",
 ]
@@ -192,7 +193,7 @@ def control_level(mesh: ControlMesh) -> Level:
         boundary=boundary,
         corner=corner,
         control_vertex=np.arange(mesh.num_vertices, dtype=np.int32),
-        rim_distance=_rim_distance(irregular_rim, vertices[rim], vertices[following][rim]),
+        rim_distance=rim_distance(irregular_rim, vertices[rim], vertices[following][rim]),
     )
 
 
@@ -222,7 +223,7 @@ def _twins(mesh: ControlMesh) -> Ints:
     return np.where(other == half_edges, -1, other).astype(np.int32)
 
 
-def _rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:
+def rim_distance(irregular: Bools, start: Ints, end: Ints) -> Ints:
     """Return the distance along rim edges to the nearest irregular rim vertex: 0, 1, or FAR.
 
     Further than 1 makes no difference (the tied zone is distance <= 1, and distances at least double with each level).

@@ -8,11 +8,13 @@ from thccs_fem.fem.assembly import assemble_cells, assemble_matrix, assemble_sca
 from thccs_fem.fem.bcs import DirichletBC, boundary_dofs, dirichletbc, locate_dofs_geometrical, region_dofs
 from thccs_fem.fem.expression import Expression
 from thccs_fem.fem.forms import Form, form
-from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.function import Constant, Function, cell_sizes
+from thccs_fem.fem.points import point_values
 from thccs_fem.fem.project import project
-from thccs_fem.fem.space import FunctionSpace, functionspace
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, cellwise, functionspace
 
 __all__ = [
+    "CellwiseSpace",
     "Constant",
     "DirichletBC",
     "Expression",
@@ -24,10 +26,13 @@ __all__ = [
     "assemble_scalar",
     "assemble_vector",
     "boundary_dofs",
+    "cell_sizes",
+    "cellwise",
     "dirichletbc",
     "form",
     "functionspace",
     "locate_dofs_geometrical",
+    "point_values",
     "project",
     "region_dofs",
 ]

@@ -2,13 +2,15 @@
 
 Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of
 a function, or one through `V.sub(c)`.  No spline interpolates: an expression is projected, in L2 of the boundary edges
-that the named functions determine, or of the cells if not all of them reach the boundary.
+that the named functions determine, or of the cells if not all of them reach the boundary.  Equations of fourth order
+prescribe the slope as well, the derivative along the conormal of the boundary: `slope=True`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +32,7 @@ AROUND = 1e-6  # weight of a value around the part that is prescribed, against 1
 RIDGE = 1e-13  # makes regular what is determined nowhere; no more than rounding elsewhere
 NUM_GAUSS = 8  # points in each direction: exact for straight pieces, far below the error of the space for others
 SIDES = np.array([[0, 1, 2, 3], [3, 7, 11, 15], [15, 14, 13, 12], [12, 8, 4, 0]])  # coefficients i + 4 j on each side
+INWARD = np.array([4, -1, -4, 1])  # from these to the next row inside
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.integer]
@@ -64,7 +67,9 @@ def locate_dofs_geometrical(V: FunctionSpace, marker: Marker) -> Ints:
     return np.flatnonzero(_marked(marker, V.reference_points)).astype(np.int32)
 
 
-def boundary_dofs(V: FunctionSpace, marker: Marker | None = None, *, tag: int | None = None) -> Ints:
+def boundary_dofs(
+    V: FunctionSpace, marker: Marker | None = None, *, tag: int | None = None, slope: bool = False
+) -> Ints:
     """Return the functions that do not vanish on the boundary or on a part of it.
 
     Args:
@@ -72,6 +77,7 @@ def boundary_dofs(V: FunctionSpace, marker: Marker | None = None, *, tag: int | 
         marker: Takes points x of shape (3, n), returns booleans; an edge counts where its two ends and its middle are
             marked.
         tag: Edge tag of the control mesh; only its boundary edges.
+        slope: Also those whose derivative across the boundary does not vanish there: what a clamped plate prescribes.
 
     Returns:
         Function numbers, ascending, shape (m,), local.
@@ -92,7 +98,8 @@ def boundary_dofs(V: FunctionSpace, marker: Marker | None = None, *, tag: int | 
         points = cells.piece_points[piece]
         for position in (corners[side], middle[side], corners[(side + 1) % 4]):
             chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
-    return np.unique(_trace_rows(cells, piece[chosen], side[chosen]).indices).astype(np.int32)
+    rows = _side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
+    return np.unique(rows.indices).astype(np.int32)
 
 
 def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: int | None = None) -> Ints:
@@ -123,7 +130,9 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
     return found[found >= 0].astype(np.int32)
 
 
-def dirichletbc(value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace | Component) -> DirichletBC:
+def dirichletbc(
+    value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace | Component, *, slope: bool = False
+) -> DirichletBC:
     """Prescribe a value on functions.
 
     Args:
@@ -132,10 +141,13 @@ def dirichletbc(value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace 
             All are read here and now.
         dofs: Function numbers, shape (n,).
         V: The space, or one component `V.sub(c)`.
+        slope: Fit value and slope of a UFL expression on the boundary, for dofs of ``boundary_dofs(V, slope=True)``.
+            It must be differentiable there. Numbers need no such thing: 0 on these dofs is value and slope 0.
 
     Raises:
-        TypeError: If the dofs are no integers, or V is no space.
-        ValueError: If the dofs are out of range, the value's shape does not fit, or a value is not finite.
+        TypeError: If the dofs are no integers, V is no space, or the slope of something without gradient is wanted.
+        ValueError: If the dofs are out of range, the value's shape does not fit, a value is not finite, or the slope is
+            wanted for dofs that have neither value nor slope on the boundary.
     """
     space, component = (V.space, V.component) if isinstance(V, Component) else (V, None)
     if not isinstance(space, FunctionSpace):
@@ -146,7 +158,7 @@ def dirichletbc(value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace 
     if isinstance(value, Constant):
         value = value.value
     if isinstance(value, ufl.core.expr.Expr) or callable(value):
-        values = _projected(space, functions, value, components.size)
+        values = _projected(space, functions, value, components.size, slope)
     else:
         values = _broadcast(np.array(value, dtype=np.float64), dofs, functions, components.size)
         if not np.isfinite(values).all():
@@ -201,26 +213,35 @@ def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
     return tagged[mesh.face_edges]
 
 
-def _trace_rows(cells: Cells, piece: Ints, side: Ints) -> sp.csr_array:
-    """Return the Bernstein coefficients of the sides of pieces, without rounding errors, shape (4 n, num_functions)."""
+def _side_rows(cells: Cells, piece: Ints, side: Ints, depth: int) -> sp.csr_array:
+    """Return Bernstein coefficients at the sides of pieces, without rounding errors, shape (4 depth n, num_functions).
+
+    The four on the side come first; with `depth` 2 those of the next row inside follow, which make up the slope.
+    """
     to_bernstein = sp.kron(sp.eye_array(piece.size, format="csr"), sp.csr_array(element.TO_BERNSTEIN), format="csr")
-    rows = (16 * np.arange(piece.size)[:, None] + SIDES[side]).ravel()
-    trace = sp.csr_array(sp.csr_array(to_bernstein[rows] @ cells.rows(piece)))
-    trace.data[np.abs(trace.data) < NONZERO] = 0.0
-    trace.eliminate_zeros()
-    return trace
+    local = SIDES[side][:, None] + np.arange(depth)[:, None] * INWARD[side][:, None, None]
+    rows = 16 * np.arange(piece.size)[:, None] + local.reshape(piece.size, 4 * depth)
+    coefficients = sp.csr_array(sp.csr_array(to_bernstein[rows.ravel()]) @ cells.rows(piece))
+    coefficients.data[np.abs(coefficients.data) < NONZERO] = 0.0
+    coefficients.eliminate_zeros()
+    return coefficients
 
 
-def _projected(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> Floats:
+def _projected(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, slope: bool) -> Floats:
     """Return the coefficients of the L2 projection of an expression on the functions, shape (functions, k).
 
-    What is fitted by least squares is the value on the part of the boundary or of the surface that the given functions
-    determine, together with all other functions there, and, with a small weight, the value around it: functions that
-    hardly reach into the part, or that others can stand in for there, are determined by that.
+    What is fitted by least squares is the value (and the slope) on the part of the boundary or of the surface that the
+    given functions determine, together with all other functions there, and, with a small weight, the value around it:
+    functions that hardly reach into the part, or that others can stand in for there, are determined by that.
     """
     if not functions.size:
         return np.zeros((0, k))
-    basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
+    if slope:
+        parts = (_value_and_slope(V, functions, value, k), _on_cells(V, functions, value, k, is_around=True))
+        basis = sp.csr_array(sp.vstack([part[0] for part in parts], format="csr"))
+        weights, values = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
+    else:
+        basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
     weights = np.where(np.isfinite(values).all(axis=1), weights, 0.0)  # around the part, it need not be defined
     weighted = sp.csr_array(sp.diags_array(weights) @ basis)
     present = np.unique(weighted.indices)
@@ -238,34 +259,119 @@ def _on_boundary(
     V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
 ) -> tuple[sp.csr_array, Floats, Floats] | None:
     """Return basis, weights and values at Gauss points of the boundary; None if a function has no trace there."""
-    cells = V.cells
-    piece, side, _ = cells.boundary_pieces
-    trace = _trace_rows(cells, piece, side)
-    if not np.isin(functions, trace.indices).all():
+    piece, side, _ = V.cells.boundary_pieces
+    rows = _side_rows(V.cells, piece, side, depth=1)
+    if not np.isin(functions, rows.indices).all():
         return None
-    chosen, is_inside = _blocks(trace, functions, 4)
-    piece, side = piece[chosen], side[chosen]
-    t, w = _gauss()
-    start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    along = np.roll(start, -1, axis=0) - start
-    points = start[:, None] + along[:, None] * t[:, None]  # (4 sides, Gauss points, 2)
-    bernstein = sp.kron(sp.eye_array(piece.size), sp.csr_array(element.bernstein_values(t)), format="csr")
-    rows = sp.csr_array(trace[(4 * chosen[:, None] + np.arange(4)).ravel()])
-    control = (element.TO_BERNSTEIN @ cells.piece_points[piece])[np.arange(piece.size)[:, None], SIDES[side]]
-    tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(t), control)
-    weights = np.linalg.norm(tangent, axis=2) * w
-    values = values_at(value, V, piece, points.reshape(-1, 2), k).reshape(piece.size, 4, t.size, k)
-    values = values[np.arange(piece.size), side]
-    return sp.csr_array(bernstein @ rows), _weighted(weights, values, is_inside), values.reshape(-1, k)
+    chosen, is_inside = _blocks(rows, functions, 4)
+    sides = _Sides(V, piece[chosen], side[chosen])
+    basis = sides.table(element.bernstein_values(sides.t)) @ rows[(4 * chosen[:, None] + np.arange(4)).ravel()]
+    values = sides.values_of(value, k)
+    return sp.csr_array(basis), _weighted(sides.lengths, values, is_inside), values.reshape(-1, k)
+
+
+def _value_and_slope(
+    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
+) -> tuple[sp.csr_array, Floats, Floats]:
+    """Return basis, weights and values at Gauss points of the boundary, then the same of h times the slope.
+
+    h is the width of the piece across the boundary, so that values and slopes weigh alike at every size of the cells.
+
+    Raises:
+        TypeError: If the value is no UFL expression, which alone can be differentiated.
+        ValueError: If a function has neither value nor slope on the boundary.
+    """
+    if not isinstance(value, ufl.core.expr.Expr):
+        raise TypeError(f"slope=True needs a UFL expression, whose gradient is known, got {type(value).__name__}")
+    piece, side, _ = V.cells.boundary_pieces
+    rows = _side_rows(V.cells, piece, side, depth=2)
+    inside = functions[~np.isin(functions, rows.indices)]
+    if inside.size:
+        raise ValueError(
+            f"{inside.size} of the {functions.size} dofs have neither value nor slope on the boundary, the first is "
+            f"{inside[0]}: slope=True is for dofs of boundary_dofs(V, slope=True)"
+        )
+    chosen, is_inside = _blocks(rows, functions, 8)
+    sides = _Sides(V, piece[chosen], side[chosen])
+    values = sides.values_of(value, k)
+    gradients = sides.values_of(ufl.grad(value), k * V.mesh.gdim).reshape(*values.shape, V.mesh.gdim)
+    slopes = np.einsum("nqkc,nqc->nqk", gradients, sides.across)
+    rows = sp.csr_array(rows[(8 * chosen[:, None] + np.arange(8)).ravel()])
+    both = np.concatenate([values, slopes], axis=1)
+    weights = _weighted(np.tile(sides.lengths, 2), both, is_inside)
+    return sp.csr_array(sides.table(sides.value_and_slope()) @ rows), weights, both.reshape(-1, k)
+
+
+class _Sides:
+    """Gauss points on sides of pieces, and the geometry there.
+
+    Attributes:
+        t: Points along a side, shape (q,).
+        tangent: Derivative of the position along the side, shape (n, q, gdim).
+        inward: Derivative of the position along the other parameter, shape (n, q, gdim).
+    """
+
+    def __init__(self, V: FunctionSpace, piece: Ints, side: Ints):
+        self.V, self.piece, self.side = V, piece, side
+        self.t, self.w = _gauss()
+        control = element.TO_BERNSTEIN @ V.cells.piece_points[piece]
+        first, second = (
+            control[np.arange(piece.size)[:, None], SIDES[side] + j * INWARD[side][:, None]] for j in (0, 1)
+        )
+        self.tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(self.t), first)
+        self.inward = np.einsum("qi,nic->nqc", element.bernstein_values(self.t), 3.0 * (second - first))
+
+    @property
+    def lengths(self) -> Floats:
+        """Weights of the Gauss points in integrals over the sides, shape (n, q)."""
+        return np.linalg.norm(self.tangent, axis=2) * self.w
+
+    @cached_property
+    def shear(self) -> Floats:
+        """What of the tangent is in `inward`, shape (n, q)."""
+        return (self.inward * self.tangent).sum(axis=2) / (self.tangent**2).sum(axis=2)
+
+    @property
+    def across(self) -> Floats:
+        """The conormal, as long as the piece is wide, inwards, shape (n, q, gdim)."""
+        return self.inward - self.shear[..., None] * self.tangent
+
+    def values_of(self, value: ValueOrExpression, k: int) -> Floats:
+        """Return values with k components, shape (n, q, k)."""
+        start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        along = np.roll(start, -1, axis=0) - start
+        points = start[:, None] + along[:, None] * self.t[:, None]  # (4 sides, Gauss points, 2)
+        values = values_at(value, self.V, self.piece, points.reshape(-1, 2), k)
+        return values.reshape(self.piece.size, 4, self.t.size, k)[np.arange(self.piece.size), self.side]
+
+    def value_and_slope(self) -> Floats:
+        """Return the eight functions of two rows at the points, then their derivatives along `across`, (n, 2 q, 8)."""
+        value = np.broadcast_to(element.bernstein_values(self.t), (*self.shear.shape, 4))
+        along = self.shear[..., None] * element.bernstein_slopes(self.t)
+        first = np.concatenate([value, -3.0 * value - along], axis=1)
+        second = np.concatenate([np.zeros_like(value), 3.0 * value], axis=1)
+        return np.concatenate([first, second], axis=2)
+
+    def table(self, values: Floats) -> sp.csr_array:
+        """Return a table of local functions of each side, or one for all, as a matrix of diagonal blocks."""
+        values = np.broadcast_to(values, (self.piece.size, *values.shape[-2:]))
+        n, rows, columns = values.shape
+        indices = np.broadcast_to(np.arange(n * columns).reshape(n, 1, columns), values.shape)
+        indptr = columns * np.arange(n * rows + 1)
+        return sp.csr_array((values.ravel(), indices.ravel(), indptr), shape=(n * rows, n * columns))
 
 
 def _on_cells(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
+    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, is_around: bool = False
 ) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the pieces that the functions live on."""
+    """Return basis, weights and values at Gauss points of the pieces that the functions live on.
+
+    With `is_around` all of them are around what is prescribed.
+    """
     cells = V.cells
     all_rows = cells.rows(np.arange(cells.num_pieces, dtype=np.int32))
     piece, is_inside = _blocks(all_rows, functions, 16)
+    is_inside &= not is_around
     t, w = _gauss()
     points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
     basis = element.bspline_values(points)

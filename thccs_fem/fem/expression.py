@@ -12,7 +12,7 @@ import ufl.algorithms
 from thccs_fem import jit
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.subdivision import Ints
 
 __all__ = ["Expression", "ValueOrExpression", "values_at"]
@@ -77,8 +77,13 @@ class Expression:
 
 
 def _local(u: Function, V: FunctionSpace) -> Floats:
-    """Return the coefficients of u on the pieces of V, shape (num_pieces, 16, block_size)."""
-    W = u.function_space
+    """Return the coefficients of u on the pieces of V, shape (num_pieces, 16, block_size).
+
+    Or (num_pieces, 1, block_size) if u is constant on each cell.
+    """
+    W = u.space
+    if isinstance(W, CellwiseSpace):
+        return u.x.array.reshape(-1, 1, W.block_size)[W.dofs_of(V.cells)[V.cells.piece_cell]]
     if W.hierarchy is V.hierarchy:
         return u.local_coefficients()
     x = V.hierarchy.prolongation(W.hierarchy) @ u.x.array.reshape(-1, W.block_size)

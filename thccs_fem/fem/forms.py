@@ -9,50 +9,41 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, overload
 
 import scipy.sparse as sp
 
 import ufl
 from thccs_fem import element, jit
-from thccs_fem.extraction import Cells
+from thccs_fem.extraction import Cells, extract
+from thccs_fem.fem.checks import MEASURES, check_metadata, check_no_facets, checked_mesh
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.space import FunctionSpace, functionspace
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, functionspace
 from thccs_fem.hierarchy import Hierarchy
-from thccs_fem.mesh import ControlMesh, Domain
+from thccs_fem.mesh import ControlMesh
 from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 from ufl.algorithms.estimate_degrees import SumDegreeEstimator
 from ufl.corealg.map_dag import map_expr_dags
-from ufl.corealg.traversal import traverse_unique_terminals
-from ufl.domain import extract_domains
 
 __all__ = ["Form", "Integral", "form"]
 
-LEAST_DEGREE, LARGEST_DEGREE = 7, 11  # of the quadrature: 4 x 4 and 6 x 6 Gauss points
+LEAST_DEGREE, LARGEST_DEGREE = 7, 11  # of the quadrature: 4 x 4 and 6 x 6 Gauss points, 4 and 6 on facets
 
-# FFCx knows them on affine cells only.
-SIZES = (
-    ufl.classes.CellVolume,
-    ufl.classes.Circumradius,
-    ufl.classes.CellDiameter,
-    ufl.classes.MinCellEdgeLength,
-    ufl.classes.MaxCellEdgeLength,
-    ufl.classes.FacetArea,
-    ufl.classes.MinFacetEdgeLength,
-    ufl.classes.MaxFacetEdgeLength,
-)
+Space = FunctionSpace | CellwiseSpace
 
 
 @dataclass(frozen=True, eq=False)
 class Integral:
-    """A compiled integral over cells.
+    """A compiled integral.
 
     Attributes:
+        kind: What it is over: "cell", "exterior_facet" or "interior_facet".
         kernel: Pointer to the compiled function, a `thccs_kernel *` of `jit.library()`.
-        tag: Face tag of its cells; None for all cells.
+        tag: Face tag of its cells, or edge tag of its facets; None for all.
         reads: Which of the form's coefficients it reads.
     """
 
+    kind: str
     kernel: Any
     tag: int | None
     reads: tuple[bool, ...]
@@ -95,49 +86,66 @@ class Form:
         return self.hierarchy.mesh
 
 
+@overload
 def form(
     ufl_form: ufl.Form | Form, /, *, quadrature_degree: int | None = None, on: FunctionSpace | None = None
-) -> Form:
-    """Compile a UFL form, or load it from the cache.
+) -> Form: ...
+
+
+@overload
+def form(
+    ufl_form: Sequence[Any], /, *, quadrature_degree: int | None = None, on: FunctionSpace | None = None
+) -> list[Any]: ...
+
+
+def form(
+    ufl_form: ufl.Form | Form | Sequence[Any],
+    /,
+    *,
+    quadrature_degree: int | None = None,
+    on: FunctionSpace | None = None,
+) -> Form | list[Any]:
+    """Compile a UFL form, or load it from the cache; or a list of them, or of lists, where None stays None.
 
     The quadrature of an integral is Gauss' rule for the degree in its metadata, as in
     ``dx(metadata={"quadrature_degree": 5})``; else for `quadrature_degree`; else for the degree of the integrand on a
-    parallelogram, where arguments and functions count 3 and the geometry 0, but at least 7 (4 x 4 points) and at most
-    11 (6 x 6). Where the space brings its own rule (`FunctionSpace.with_integration`), that one holds.
+    parallelogram, where arguments and functions count 3 and the geometry 0, but at least 7 (4 points along each side)
+    and at most 11 (6). Where the space brings its own rule (`FunctionSpace.with_integration`), that one holds.
 
     Args:
-        ufl_form: A sum of integrals over ``dx``, or ``dx(tag)`` with a face tag of the mesh, or ``dx((tag, tag))``. A
-            compiled form is returned as it is.
+        ufl_form: A sum of integrals over ``dx``, the surface, ``ds``, its boundary, and ``dS``, the edges between
+            cells; or over parts, ``dx(tag)`` or ``dx((tag, tag))`` with face tags of the mesh, ``ds(tag)`` and
+            ``dS(tag)`` with its edge tags. Edges are divided where finer cells meet a coarser one. A compiled form is
+            returned as it is.
         quadrature_degree: Degree where the metadata has none.
         on: A space that counts as one of the form's: its cells are integrated on where no other is finer.
 
     Raises:
         TypeError: It is no UFL form, or a coefficient or constant has no values.
-        ValueError: It is zero, has no or several meshes, an unknown tag, an element other than THCCS, spaces that are
-            not refinements of one another, a cell size, or a quadrature degree of its own on cells with another one.
-        NotImplementedError: It has integrals other than dx.
+        ValueError: It is zero, has no or several meshes, an unknown tag, other elements, spaces that are not
+            refinements of one another, a cell size, functions of several blocks, something in dS that is not
+            restricted to one side, or, on cells with a quadrature of their own, another one or integrals over facets.
+        NotImplementedError: It has integrals other than dx, ds and dS.
         OSError: There is no C compiler, or the cache can't be written.
     """
     if isinstance(ufl_form, Form):
         return ufl_form
-    _check_form(ufl_form)
-    mesh = _mesh(ufl_form)
-    for integral in ufl_form.integrals():
-        _check_integral(integral, mesh)
-    arguments = tuple(ufl_form.arguments())
-    for function in (*arguments, *ufl_form.coefficients()):
-        _check_space(function, function.ufl_function_space())
-    _check_values(ufl_form)
-    spaces = tuple(argument.ufl_function_space() for argument in arguments)
-    all_spaces = [*spaces, *(function.function_space for function in ufl_form.coefficients())]
+    if isinstance(ufl_form, Sequence):
+        return [None if f is None else form(f, quadrature_degree=quadrature_degree, on=on) for f in ufl_form]
+    mesh = checked_mesh(ufl_form)
+    spaces = tuple(argument.ufl_function_space() for argument in ufl_form.arguments())
+    all_spaces: list[Space] = [*spaces, *(function.function_space for function in ufl_form.coefficients())]
     all_spaces += [] if on is None else [on]
     finest = _finest(all_spaces) if all_spaces else functionspace(mesh, ("THCCS", element.DEGREE))
     cells = finest.integration_cells
+    hierarchy = cells.hierarchy if finest.hierarchy is None else finest.hierarchy
+    if finest.integration is not extract:
+        check_no_facets(ufl_form)
     if cells.quadrature_degree is not None:
         quadrature_degree = cells.quadrature_degree
-        _check_metadata(ufl_form, quadrature_degree)
+        check_metadata(ufl_form, quadrature_degree)
     ufl_form = _with_quadrature(ufl_form, quadrature_degree)
-    (compiled,), module = jit.compile_forms([ufl_form])
+    compiled, module = _compiled(ufl_form)
     given = ufl_form.coefficients()
     positions = [compiled.original_coefficient_positions[i] for i in range(compiled.num_coefficients)]
     return Form(
@@ -146,85 +154,16 @@ def form(
         coefficients=tuple(given[i] for i in positions),
         constants=tuple(ufl_form.constants()),
         integrals=_integrals(compiled, module),
-        hierarchy=finest.hierarchy,
+        hierarchy=hierarchy,
         cells=cells,
-        transfers=_transfers(finest, all_spaces),
+        transfers=_transfers(hierarchy, all_spaces),
         module=module,
     )
 
 
-def _check_form(ufl_form: object) -> None:
-    if not isinstance(ufl_form, ufl.Form | ufl.ZeroBaseForm):
-        given = type(ufl_form).__name__
-        raise TypeError(f"form needs a sum of UFL integrals, got {given}: is there a * ufl.dx missing?")
-    integrals = () if isinstance(ufl_form, ufl.ZeroBaseForm) else ufl_form.integrals()
-    if all(isinstance(integral.integrand(), ufl.classes.Zero) for integral in integrals):
-        raise ValueError(
-            "the form is zero, so that nothing is known of its functions: for a zero right-hand side write "
-            "fem.Constant(msh, 0.0) * v * ufl.dx"
-        )
-
-
-def _mesh(ufl_form: ufl.Form) -> ControlMesh:
-    """Return the mesh of all measures, functions, constants and coordinates."""
-    domains = {*ufl_form.ufl_domains(), *(d for integral in ufl_form.integrals() for d in extract_domains(integral))}
-    if len(domains) != 1:
-        raise ValueError(f"the form has measures or functions on {len(domains)} meshes: all must be on one")
-    (domain,) = domains
-    if not isinstance(domain, Domain):
-        raise ValueError(
-            f"the form is on {domain!r}, which is not the domain of a control mesh: use functions of a space from "
-            f"fem.functionspace(msh, ...), or dx(domain=msh)"
-        )
-    return domain.control_mesh
-
-
-def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
-    """Refuse what is not integrated here, or would be integrated wrongly."""
-    kind, ids = integral.integral_type(), integral.subdomain_id()
-    if kind != "cell":
-        measure = ufl.measure.integral_type_to_measure_name[kind]
-        raise NotImplementedError(
-            f"the form has an integral over {measure} ({kind}); only dx is implemented. On the boundary impose values "
-            f"by fem.dirichletbc, or leave the term out for homogeneous natural conditions."
-        )
-    if integral.subdomain_data() is not None:
-        raise ValueError(
-            "the measure has subdomain_data; tags belong to the mesh here: ControlMesh(..., face_tags=tags) and dx(tag)"
-        )
-    for tag in ids if isinstance(ids, tuple) else (ids,):
-        if tag != "everywhere" and not (tag >= 0 and (mesh.face_tags == tag).any()):
-            known = sorted({int(t) for t in mesh.face_tags})
-            raise ValueError(f"the form has dx({tag!r}), but tags are from 0, and those of the mesh are {known}")
-    for terminal in traverse_unique_terminals(integral.integrand()):
-        if isinstance(terminal, SIZES):
-            raise ValueError(
-                f"the form has {type(terminal).__name__}, which can't be computed on curved cells: hand the cell size "
-                f"in as data, a fem.Function or fem.Constant, or weight the values of fem.assemble_cells with it"
-            )
-
-
-def _check_space(function: ufl.core.expr.Expr, space: ufl.FunctionSpace) -> None:
-    if not isinstance(space, FunctionSpace):
-        raise ValueError(
-            f"{function} has the element {space.ufl_element()!r}, but all arguments and functions of a form must be in "
-            f'spaces from fem.functionspace(msh, ("THCCS", 3)): use fem.project to carry others over'
-        )
-
-
-def _check_values(ufl_form: ufl.Form) -> None:
-    """Refuse UFL's own coefficients and constants."""
-    for coefficient in ufl_form.coefficients():
-        if not isinstance(coefficient, Function):
-            raise TypeError(f"{coefficient} is a {type(coefficient).__name__} without values: use fem.Function(V)")
-    for constant in ufl_form.constants():
-        if not isinstance(constant, Constant):
-            raise TypeError(f"{constant} is a {type(constant).__name__} without a value: use fem.Constant(msh, value)")
-
-
-def _finest(spaces: Sequence[FunctionSpace]) -> FunctionSpace:
+def _finest(spaces: Sequence[Space]) -> Space:
     """Return a space of which all the others are coarsenings."""
-    for finest in spaces:
+    for finest in sorted(spaces, key=lambda space: isinstance(space, CellwiseSpace)):
         if all(finest.is_refinement_of(other) for other in spaces):
             return finest
     listed = "\n".join(f"  {space!r}" for space in dict.fromkeys(spaces))
@@ -235,25 +174,28 @@ def _finest(spaces: Sequence[FunctionSpace]) -> FunctionSpace:
     )
 
 
-def _transfers(finest: FunctionSpace, spaces: Sequence[FunctionSpace]) -> dict[Hierarchy, sp.csr_array]:
+def _transfers(finest: Hierarchy, spaces: Sequence[Space]) -> dict[Hierarchy, sp.csr_array]:
     """Return the prolongations of scalar functions from all hierarchies that differ from the finest."""
-    hierarchies = dict.fromkeys(space.hierarchy for space in spaces)
+    hierarchies = dict.fromkeys(space.hierarchy for space in spaces if isinstance(space, FunctionSpace))
     return {
-        coarse: finest.hierarchy.prolongation(coarse)
+        coarse: finest.prolongation(coarse)
         for coarse in hierarchies
-        if not (coarse is finest.hierarchy or coarse.same_as(finest.hierarchy))
+        if not (coarse is finest or coarse.same_as(finest))
     }
 
 
-def _check_metadata(ufl_form: ufl.Form, degree: int) -> None:
-    """Refuse rules other than that of the given degree."""
-    for integral in ufl_form.integrals():
-        metadata = integral.metadata()
-        if metadata.get("quadrature_degree", degree) != degree or "quadrature_rule" in metadata:
-            raise ValueError(
-                f"the metadata {metadata} ask for a rule of their own, but the cells of the space are made for degree "
-                f"{degree} alone: leave them out, or integrate on a space without with_integration"
-            )
+def _compiled(ufl_form: ufl.Form) -> tuple[Any, ModuleType]:
+    """Return the `ufcx_form` and its module; say what UFL misses on facets."""
+    try:
+        (compiled,), module = jit.compile_forms([ufl_form])
+    except Exception as error:
+        if "restrict" not in str(error).lower() or type(error) is OSError:
+            raise
+        raise ValueError(
+            f"{error} In integrals over dS each side has its own value of gradients, normals and functions that are "
+            f"constant on cells: write w('+'), w('-'), jump(w), avg(w) or jump(w, n)"
+        ) from error
+    return compiled, module
 
 
 def _with_quadrature(ufl_form: ufl.Form, degree: int | None) -> ufl.Form:
@@ -290,17 +232,19 @@ def _quadrature_degree(integral: ufl.Integral) -> int:
 
 
 def _integrals(compiled: Any, module: ModuleType) -> tuple[Integral, ...]:
-    """Return the cell integrals, which come first, of a `ufcx_form`."""
+    """Return the integrals of a `ufcx_form`, which stand there kind by kind."""
     ffi = jit.library().ffi
     integrals = []
-    for i in range(compiled.form_integral_offsets[0], compiled.form_integral_offsets[1]):
-        integral, tag = compiled.form_integrals[i], compiled.form_integral_ids[i]
-        address = int(module.ffi.cast("uintptr_t", integral.tabulate_tensor_float64))
-        integrals.append(
-            Integral(
-                kernel=ffi.cast("thccs_kernel *", address),
-                tag=None if tag == -1 else tag,  # FFCx's sign for "everywhere"
-                reads=tuple(integral.enabled_coefficients[j] for j in range(compiled.num_coefficients)),
+    for block, kind in enumerate(MEASURES):
+        for i in range(compiled.form_integral_offsets[block], compiled.form_integral_offsets[block + 1]):
+            integral, tag = compiled.form_integrals[i], compiled.form_integral_ids[i]
+            address = int(module.ffi.cast("uintptr_t", integral.tabulate_tensor_float64))
+            integrals.append(
+                Integral(
+                    kind=kind,
+                    kernel=ffi.cast("thccs_kernel *", address),
+                    tag=None if tag == -1 else tag,  # FFCx's sign for "everywhere"
+                    reads=tuple(integral.enabled_coefficients[j] for j in range(compiled.num_coefficients)),
+                )
             )
-        )
     return tuple(integrals)

@@ -8,11 +8,14 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
+from thccs_fem.element import NUM_FUNCTIONS
 from thccs_fem.extraction import evaluate_pieces
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, cellwise
 from thccs_fem.mesh import ControlMesh
 
-__all__ = ["Constant", "Function", "Vector"]
+__all__ = ["Constant", "Function", "Vector", "cell_sizes"]
+
+NUM_GAUSS = 4  # points in each direction for areas
 
 
 class Vector:
@@ -32,15 +35,15 @@ class Vector:
 
 
 class Function(ufl.Coefficient):
-    """A function of a THCCS space.
+    """A function of a THCCS space, or one that is constant on each cell.
 
     Args:
         V: The space.
         name: Name in output.
     """
 
-    def __init__(self, V: FunctionSpace, name: str = "f"):
-        if not isinstance(V, FunctionSpace):
+    def __init__(self, V: FunctionSpace | CellwiseSpace, name: str = "f"):
+        if not isinstance(V, FunctionSpace | CellwiseSpace):
             raise TypeError(f"a Function needs a space from fem.functionspace, got {type(V).__name__}")
         super().__init__(V)  # type: ignore[no-untyped-call]  # UFL is typed in part
         self.name = name
@@ -48,7 +51,12 @@ class Function(ufl.Coefficient):
 
     @property
     def function_space(self) -> FunctionSpace:
-        """The space."""
+        """The space; for the type checker a THCCS space, which nearly all are."""
+        return self.ufl_function_space()  # type: ignore[no-untyped-call]  # as above
+
+    @property
+    def space(self) -> FunctionSpace | CellwiseSpace:
+        """The space, of either kind."""
         return self.ufl_function_space()  # type: ignore[no-untyped-call]  # as above
 
     @property
@@ -64,8 +72,10 @@ class Function(ufl.Coefficient):
 
     def local_coefficients(self) -> npt.NDArray[np.float64]:
         """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, block_size)."""
-        V = self.function_space
-        return V.cells.local(self.x.array.reshape(-1, V.block_size))
+        V, values = self.space, self.x.array.reshape(-1, self.space.block_size)
+        if isinstance(V, CellwiseSpace):  # the local functions add up to one
+            return np.repeat(values[V.dofs_of(V.cells)[V.cells.piece_cell], None], NUM_FUNCTIONS, axis=1)
+        return V.cells.local(values)
 
     def eval(
         self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
@@ -83,13 +93,27 @@ class Function(ufl.Coefficient):
         Raises:
             ValueError: If a face, coordinate or corner is out of range.
         """
-        V = self.function_space
+        V = self.space
         piece, position = V.cells.locate(faces, uv, corner)
-        values = evaluate_pieces(self.local_coefficients(), piece, position)
+        if isinstance(V, CellwiseSpace):
+            values = self.x.array.reshape(-1, V.block_size)[V.dofs_of(V.cells)[V.cells.piece_cell[piece]]]
+        else:
+            values = evaluate_pieces(self.local_coefficients(), piece, position)
         return values if V.value_shape else values[:, 0]
 
     def __str__(self) -> str:
         return self.name
+
+
+def cell_sizes(V: FunctionSpace) -> Function:
+    """Return the sizes of the cells of V, each the root of its area, as a function that is constant on each cell."""
+    cells = V.cells
+    t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
+    points = np.stack(np.meshgrid((t + 1.0) / 2.0, (t + 1.0) / 2.0), axis=-1).reshape(-1, 2)
+    areas = cells.area_element(np.arange(cells.num_pieces, dtype=np.int32), points) @ np.outer(w, w).ravel() / 4.0
+    h = Function(cellwise(V), name="h")
+    h.x.array = np.sqrt(np.bincount(cells.piece_cell, weights=areas, minlength=cells.num_cells))
+    return h
 
 
 class Constant(ufl.Constant):

@@ -19,13 +19,15 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 import ufl
-from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
-from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem import blocks
+from thccs_fem.fem.assembly import assemble_vector
+from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout, constraints
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
 from ufl.algorithms import apply_algebra_lowering, apply_derivatives
+from ufl.corealg.traversal import unique_pre_traversal
 
 __all__ = [
     "Constants",
@@ -35,6 +37,7 @@ __all__ = [
     "constrain",
     "constraints",
     "drops_constants",
+    "is_fourth_order",
     "is_symmetric",
     "unfixed_constants",
 ]
@@ -49,131 +52,107 @@ LARGEST_CONDITION = 1e12  # of a scaled matrix; singular ones come to 1e13 and m
 
 
 class LinearSystem:
-    """The equations A u = b of a weak form.
-
-    Args:
-        a: Bilinear form.
-        L: Linear form.
-        bcs: Conditions on the space of the unknown; where two prescribe the same dof, the later one holds.
-        u: The unknown; None: a new function.
+    """The equations A u = b of a weak form, or of several: see the problems of `fem.scipy` for the arguments.
 
     Attributes:
-        a: Compiled bilinear form.
-        L: Compiled linear form.
+        a: Compiled bilinear forms, row by row.
+        L: Compiled linear forms; None where it is zero.
+        layout: The dofs of all unknowns.
         bcs: Conditions; others may be put in their place before the next `assemble`.
-        u: The unknown.
-        b: Right-hand side, zero before the first `assemble`.
+        unknowns: The unknowns.
+        load: What is added to b; None: nothing.
+        b: Right-hand side, zero before the first `assemble`, shape (num_dofs,).
         constants: Constants in the kernel of A, of which b is cleared; None if there are none.
-
-    Raises:
-        TypeError: A form is no form, or a condition none.
-        ValueError: The forms have not the arguments of an equation, or u or a condition is in another space.
     """
 
     def __init__(
         self,
-        a: ufl.Form | Form,
-        L: ufl.Form | Form,
+        a: ufl.Form | Form | Sequence[Sequence[ufl.Form | Form | None]],
+        L: ufl.Form | Form | Sequence[ufl.Form | Form | None],
         *,
-        bcs: Sequence[DirichletBC] = (),
-        u: Function | None = None,
+        bcs: Conditions = (),
+        u: Function | Sequence[Function] | None = None,
+        load: npt.ArrayLike | None = None,
     ):
-        self.a, self.L = form(a), form(L)
-        V = _unknown_space(self.a, self.L)
-        if u is not None and u.function_space != V:
-            raise ValueError(
-                f"u is in {u.function_space}, but the trial function in {V}: give a fem.Function of that space"
-            )
-        self.u = Function(V) if u is None else u
+        bilinear = blocks.rows(a)
+        linear = blocks.columns(L, len(bilinear))
+        self.layout = blocks.Layout(blocks.spaces_of(bilinear, linear))
+        spaces = self.layout.spaces
+        self.a = [blocks.compiled(row, spaces) for row in bilinear]
+        self.L = blocks.compiled(linear, spaces)
+        self.unknowns = blocks.unknowns(u, spaces)
+        self._is_single = len(spaces) == 1 and not isinstance(a if u is None else u, list | tuple)
         self.bcs = bcs
-        self.b = np.zeros(V.num_dofs)
+        self.load = load
+        self.b = np.zeros(self.layout.num_dofs)
         self.constants: Constants | None = None
-        self._drops_constants = drops_constants(self.a)
-        self._dofs, self._values = constraints(bcs, V)
-        self._A: sp.csr_array | None = None
+        self._tolerance = np.where(drops_constants(self.a, spaces), PRESCRIBED, VANISHING)
+        self._dofs, self._values = self.layout.constraints(bcs)
+        self._matrix: BlockMatrix | None = None
+
+    @property
+    def u(self) -> Any:
+        """The unknown, or the list of them."""
+        return self.unknowns[0] if self._is_single else self.unknowns
+
+    @property
+    def matrix(self) -> BlockMatrix:
+        """The matrix as last assembled, with its blocks."""
+        if self._matrix is None:
+            self.assemble()
+        assert self._matrix is not None  # assemble has made it
+        return self._matrix
 
     @property
     def A(self) -> sp.csr_array:
         """The matrix as last assembled; it keeps its memory."""
-        if self._A is None:
-            self.assemble()
-        assert self._A is not None  # assemble has made it
-        return self._A
+        return self.matrix.whole
 
     def assemble(self) -> None:
-        """Assemble A and b with the present values of coefficients, constants and conditions.
+        """Assemble A and b with the present values of coefficients, constants, conditions and load.
 
         Raises:
-            ValueError: A load that is not zero on average, where constants are in the kernel.
+            ValueError: A load that is not zero on average, where constants are in the kernel, or of another shape.
         """
-        V = self.u.function_space
-        self._dofs, self._values = constraints(self.bcs, V)
-        if self._A is None:
-            self._A = assemble_matrix(self.a)
+        self._dofs, self._values = self.layout.constraints(self.bcs)
+        if self._matrix is None:
+            self._matrix = BlockMatrix(self.a, self.layout.spaces)
         else:
-            assemble_matrix(self._A, self.a)
-        self.b[:] = assemble_vector(self.L)
+            self._matrix.assemble()
+        A = self._matrix.whole
+        self.b[:] = self.layout.vector(self.L) + self._checked_load()
         if self._dofs.size:
-            prescribed = np.zeros(V.num_dofs)
+            prescribed = np.zeros(self.b.size)
             prescribed[self._dofs] = self._values
-            self.b -= self._A @ prescribed
+            self.b -= A @ prescribed
             self.b[self._dofs] = self._values
-            constrain(self._A, self._dofs)
-        is_fixed = self._dofs.size > 0 and V.block_size == V.mesh.num_components == 1
-        self.constants = None if is_fixed else unfixed_constants(self._A, V, self._drops_constants)
+            constrain(A, self._dofs)
+        self.constants = unfixed_constants(A, self.layout, self._tolerance, self._dofs)
         if self.constants is not None:
+            self.constants.check_load(self.b)
             self.b[:] = self.constants.cleared(self.b)
 
     def regular(self) -> sp.csr_array:
         """Return A, or where constants are in its kernel, a regular matrix with the same solution up to constants."""
         return self.A if self.constants is None else self.constants.pinned(self.A)
 
-    def accept(self, x: Floats) -> Function:
-        """Return the unknown with the values that solve the equations, prescribed values exact, free means zero."""
-        self.u.x.array = x if self.constants is None else self.constants.with_mean_zero(x)
-        self.u.x.array[self._dofs] = self._values
+    def accept(self, x: Floats) -> Any:
+        """Return the unknowns with the values that solve the equations, prescribed values exact, free means zero."""
+        x = x.copy() if self.constants is None else self.constants.with_mean_zero(x)
+        x[self._dofs] = self._values
+        self.layout.spread(x, self.unknowns)
         return self.u
 
-
-def _unknown_space(a: Form, L: Form) -> FunctionSpace:
-    if a.rank != 2 or L.rank != 1:
-        raise ValueError(
-            f"a has {a.rank} arguments and L has {L.rank}: a is the bilinear form, in a trial and a test function, and "
-            f"L the linear one, in a test function alone"
-        )
-    test, trial = a.spaces
-    if test != trial or L.spaces[0] != test:
-        raise ValueError(
-            f"the trial function of a is in {trial}, its test function in {test} and that of L in {L.spaces[0]}: an "
-            f"equation needs the same space for all three"
-        )
-    return trial
+    def _checked_load(self) -> Floats | float:
+        if self.load is None:
+            return 0.0
+        load = np.asarray(self.load, dtype=np.float64)
+        if load.shape != self.b.shape:
+            raise ValueError(f"load has shape {load.shape}, but there are {self.b.size} dofs: give ({self.b.size},)")
+        return load
 
 
 # ---- Dirichlet conditions --------------------------------------------------------------------------------------------
-
-
-def constraints(bcs: Sequence[DirichletBC], V: FunctionSpace) -> tuple[Ints, Floats]:
-    """Return the prescribed dofs, ascending, and their values; where two conditions prescribe a dof, the later one's.
-
-    Raises:
-        TypeError: If a condition is none of ours.
-        ValueError: If a condition is on another space.
-    """
-    if isinstance(bcs, DirichletBC):
-        raise TypeError("bcs is a single condition: give a list, bcs=[bc]")
-    for bc in bcs:
-        if not isinstance(bc, DirichletBC):
-            raise TypeError(f"bcs holds a {type(bc).__name__}: make conditions with fem.dirichletbc(value, dofs, V)")
-        if bc.function_space != V:
-            raise ValueError(
-                f"a condition is on {bc.function_space}, but the unknown is in {V}: make it with "
-                f"fem.dirichletbc(value, dofs, V) for that space, with dofs found for it"
-            )
-    dofs = np.concatenate([np.zeros(0, dtype=np.int32), *(bc.dofs for bc in reversed(bcs))])
-    values = np.concatenate([np.zeros(0), *(bc.values for bc in reversed(bcs))])
-    dofs, first = np.unique(dofs, return_index=True)
-    return dofs, values[first]
 
 
 def constrain(A: sp.csr_array, dofs: Ints) -> None:
@@ -227,10 +206,14 @@ class Constants:
         return x - self.spread(self.sums(x * self.integrals) / self.areas)
 
     def cleared(self, b: Floats) -> Floats:
-        """Return a load without the small mean that quadrature leaves.
+        """Return a load without its mean."""
+        return b - self.integrals * self.spread(self.sums(b) / self.areas)
+
+    def check_load(self, b: Floats) -> None:
+        """Raise if the mean of a load is more than what quadrature leaves.
 
         Raises:
-            ValueError: If the mean is not small.
+            ValueError: It is.
         """
         totals = self.sums(b)
         means = totals / self.areas
@@ -244,7 +227,6 @@ class Constants:
                 f"without Dirichlet conditions, but the mean of the load is {listed}{several} instead of zero. "
                 f"Subtract it from the load, or prescribe values somewhere"
             )
-        return b - self.integrals * self.spread(means)
 
     def pinned(self, A: sp.csr_array) -> sp.csr_array:
         """Return A plus a positive multiple of the square of one coefficient of each constant, with A's pattern.
@@ -260,43 +242,67 @@ class Constants:
         return sp.csr_array((data, A.indices, A.indptr), shape=A.shape)
 
 
-def drops_constants(a: Form) -> Bools:
-    """Return for each component whether a bilinear form is zero for constants, on both sides, by its symbols alone.
+def drops_constants(a: Sequence[Sequence[Form | None]], spaces: Sequence[FunctionSpace]) -> Bools:
+    """Return for each component whether bilinear forms are zero for constants, on both sides, by their symbols alone.
 
     Rounding cannot hide that, other than in the matrix: fourth-order forms have entries of any size.
+
+    Args:
+        a: Blocks, row by row.
+        spaces: Spaces of the unknowns.
+
+    Returns:
+        Shape (components of all unknowns,).
     """
-    lowered = apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(a.ufl_form))
-    k = a.spaces[1].block_size
-    constants = [ufl.as_vector(unit.tolist()) for unit in np.eye(k)] if a.spaces[1].value_shape else [ufl.as_ufl(1.0)]
-    zero = [[ufl.replace(lowered, {u: c}).empty() for u in lowered.arguments()] for c in constants]
-    return np.array(zero).all(axis=1)
+    found = []
+    for i, V in enumerate(spaces):
+        tests = [_drops(block, 0) for block in a[i] if block is not None]
+        trials = [_drops(block, 1) for block in (row[i] for row in a) if block is not None]
+        found.append(np.all([np.ones(V.block_size, dtype=bool), *tests, *trials], axis=0))
+    return np.concatenate(found)
 
 
-def unfixed_constants(A: sp.csr_array, V: FunctionSpace, dropped: Bools) -> Constants | None:
+def _drops(a: Form, number: int) -> Bools:
+    """Return for each component of one argument whether the form is zero where it is constant."""
+    lowered = _lowered(a)
+    V = a.spaces[number]
+    constants = [ufl.as_vector(unit.tolist()) for unit in np.eye(V.block_size)] if V.value_shape else [ufl.as_ufl(1.0)]
+    return np.array([ufl.replace(lowered, {a.ufl_form.arguments()[number]: c}).empty() for c in constants])
+
+
+def _lowered(a: Form) -> ufl.Form:
+    return apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(a.ufl_form))
+
+
+def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: Ints | None = None) -> Constants | None:
     """Return the constants in the kernel of a matrix, and of its transpose; None if there are none.
 
     Args:
-        A: A matrix on V, with conditions.
-        V: The space.
-        dropped: What `drops_constants` says of the form.
+        A: The matrix, with conditions.
+        layout: Its dofs.
+        tolerance: For each component what is zero: sums of rows, relative to sums of absolute values.
+        dofs: Prescribed dofs.
     """
-    k = V.block_size
-    ones = np.tile(np.eye(k), (V.num_functions, 1))
-    tolerance = np.where(dropped, PRESCRIBED, VANISHING)
+    component, k = layout.component, tolerance.size
+    is_connected = all(V.mesh.num_components == 1 for V in layout.spaces)
+    if k == 1 and is_connected and dofs is not None and dofs.size:
+        return None
+    ones = (component[:, None] == np.arange(k)).astype(np.float64)
     vanishing = _vanishing(A, ones, tolerance) & _vanishing(A.T, ones, tolerance)
     if not vanishing.any(axis=0).any():
         return None
-    part = np.zeros(V.num_functions, dtype=np.int32)
-    if V.mesh.num_components > 1:
-        _, part_of_dofs = csgraph.connected_components(A, directed=False)  # stored zeros connect as well
-        part = part_of_dofs[::k]
+    part = np.zeros(component.size, dtype=np.int32)
+    if not is_connected:
+        _, part = csgraph.connected_components(A, directed=False)  # stored zeros connect as well
     defects = np.zeros((int(part.max()) + 1, k), dtype=np.int64)
-    np.add.at(defects, np.repeat(part, k), ~vanishing)
-    free = defects == 0
+    np.add.at(defects, part, ~vanishing)
+    free = np.zeros(defects.shape, dtype=bool)
+    free[part, component] = True
+    free &= defects == 0
     if not free.any():
         return None
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1).astype(np.int32)
-    return Constants(number[part].ravel(), _integrals(V))
+    return Constants(number[part, component], np.concatenate([_integrals(V) for V in layout.spaces]))
 
 
 def _vanishing(A: Any, ones: Floats, tolerance: Floats) -> Bools:
@@ -315,6 +321,20 @@ def _integrals(V: FunctionSpace) -> Floats:
 def is_symmetric(A: sp.csr_array) -> bool:
     """Return whether a matrix is symmetric up to rounding."""
     return bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
+
+
+def is_fourth_order(a: Sequence[Sequence[Form | None]]) -> bool:
+    """Return whether a bilinear form has second derivatives of its arguments."""
+    integrands = (part.integrand() for row in a for block in row if block for part in _lowered(block).integrals())
+    return any(_is_second_derivative(node) for integrand in integrands for node in unique_pre_traversal(integrand))
+
+
+def _is_second_derivative(node: Any) -> bool:
+    """Return whether it is the gradient of the gradient of an argument."""
+    times = 0
+    while isinstance(node, ufl.classes.Grad):
+        node, times = node.ufl_operands[0], times + 1
+    return times > 1 and isinstance(node, ufl.Argument)
 
 
 def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
+import scipy.sparse as sp
 
 import basix
 import ufl
@@ -12,12 +15,13 @@ from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.scipy import conjugate_gradients
+from thccs_fem.fem.scipy import conjugate_gradients, solve
 from thccs_fem.fem.space import FunctionSpace
 
-__all__ = ["project"]
+__all__ = ["project", "projected_over"]
 
 Floats = npt.NDArray[np.float64]
+Norm = Literal["L2", "H1"]
 
 DEGREE = 11  # of the quadrature, 6 x 6 points: the same on both sides, so that functions of V stay what they are
 TOLERANCE = 1e-13  # mass matrices are scaled by their diagonal: 100 to 300 iterations on any mesh and refinement
@@ -49,6 +53,35 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
     components = [conjugate_gradients(mass, b, TOLERANCE) for b in load.T]
     projection.x.array = np.stack(components, axis=1).ravel()
     return projection
+
+
+def projected_over(common: FunctionSpace, u: Function, V: FunctionSpace, norm: Norm) -> Floats:
+    """Return the function of V nearest to u, all integrals being over the cells of a refinement of both spaces.
+
+    With G the inner products of the functions of `common`, and P and Q the prolongations to it from V and from the
+    space of u, P^T G P x = P^T G Q u. Constants lie in all three spaces, so that either norm keeps the integral of u
+    (over these cells). What the solver leaves of the residual against constants, a constant takes away.
+
+    Args:
+        common: Scalar space that refines V and the space of u.
+        u: Function with values of the shape of V's.
+        V: The space.
+        norm: "L2": (x, v). "H1": (x, v) + (grad x, grad v).
+
+    Returns:
+        Coefficients, shape (num_dofs of V,).
+    """
+    trial, test = ufl.TrialFunction(common), ufl.TestFunction(common)
+    product = ufl.inner(trial, test)
+    if norm == "H1":
+        product += ufl.inner(ufl.grad(trial), ufl.grad(test))
+    G = assemble_matrix(form(product * ufl.dx, quadrature_degree=DEGREE))
+    P, Q = (common.hierarchy.prolongation(W.hierarchy) for W in (V, u.function_space))
+    load = P.T @ (G @ (Q @ u.x.array.reshape(-1, V.block_size)))
+    A = sp.csr_array(P.T @ G @ P)
+    x = np.stack([solve(A, b) for b in load.T], axis=1)
+    x += (load - A @ x).sum(axis=0) / A.sum()
+    return x.ravel()
 
 
 def _as_ufl(value: object, V: FunctionSpace) -> ufl.core.expr.Expr:

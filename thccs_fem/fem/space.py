@@ -2,13 +2,14 @@
 
 A `FunctionSpace` is a UFL function space whose functions are the active functions of a `Hierarchy`, once for every
 component of the value.  Degree of freedom `block_size * i + c` is component c of function i.
+A `CellwiseSpace` holds coefficients that are constant on each cell.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +25,15 @@ from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.subdivision import Ints
 
-__all__ = ["Component", "FunctionSpace", "functionspace"]
+__all__ = ["CellwiseSpace", "Component", "FunctionSpace", "cellwise", "functionspace"]
 
 FAMILY, DEGREE = "THCCS", 3
+
+ConstantElement = (
+    tuple[Literal["DG"], Literal[0]]
+    | tuple[Literal["DG"], Literal[0], tuple[()]]
+    | tuple[Literal["DG"], Literal[0], tuple[int]]
+)
 
 
 class FunctionSpace(ufl.FunctionSpace):
@@ -127,8 +134,15 @@ class FunctionSpace(ufl.FunctionSpace):
         """
         return FunctionSpace(self.hierarchy, self.value_shape, rule)
 
-    def is_refinement_of(self, other: FunctionSpace) -> bool:
-        """Return whether every scalar function of `other` lies in this space, integrated in the same way."""
+    def is_refinement_of(self, other: FunctionSpace | CellwiseSpace) -> bool:
+        """Return whether every scalar function of `other` lies in this space, integrated in the same way.
+
+        Or, if it is cellwise, whether it is constant on each of the cells here.
+        """
+        if isinstance(other, CellwiseSpace):
+            return other.mesh is self.mesh and (
+                other.hierarchy is None or self.hierarchy.is_refinement_of(other.hierarchy)
+            )
         return self.integration is other.integration and (
             self.hierarchy is other.hierarchy or self.hierarchy.is_refinement_of(other.hierarchy)
         )
@@ -164,6 +178,108 @@ class FunctionSpace(ufl.FunctionSpace):
         )
 
 
+class CellwiseSpace(ufl.FunctionSpace):
+    """Functions that are constant on each face of a control mesh, or each cell of a hierarchy; for coefficients.
+
+    Make one with ``functionspace(msh, ("DG", 0))`` or with `cellwise`. Degree of freedom `block_size * i + c` is
+    component c on face or cell i. What is finer than these has the value of the face or cell it lies in.
+
+    Args:
+        mesh: The control mesh.
+        hierarchy: The hierarchy with the cells; None: the faces of the mesh.
+        value_shape: () for scalars, (k,) for vectors.
+    """
+
+    integration = staticmethod(extract)
+
+    def __init__(self, mesh: ControlMesh, hierarchy: Hierarchy | None = None, value_shape: tuple[int, ...] = ()):
+        super().__init__(mesh.ufl_domain(), element.constant(value_shape))  # type: ignore[no-untyped-call]  # as above
+        self.mesh = mesh
+        self.hierarchy = hierarchy
+        self.block_size = int(np.prod(value_shape, dtype=int))
+
+    @property
+    def num_cells(self) -> int:
+        """Number of faces or cells, global."""
+        return self.mesh.num_faces if self.hierarchy is None else self.cells.num_cells
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of degrees of freedom, block_size for each face or cell, global."""
+        return self.block_size * self.num_cells
+
+    @cached_property
+    def cells(self) -> Cells:
+        """The cells, those of level 0 for the faces of the mesh."""
+        return _cells(Hierarchy.on(self.mesh) if self.hierarchy is None else self.hierarchy, extract)
+
+    @property
+    def integration_cells(self) -> Cells:
+        """The cells: what forms are integrated on if these are the finest."""
+        return self.cells
+
+    def is_refinement_of(self, other: FunctionSpace | CellwiseSpace) -> bool:
+        """Return whether each cell here lies in one of those of `other`, with integrals over the same."""
+        if self.hierarchy is None:
+            return isinstance(other, CellwiseSpace) and other.hierarchy is None and other.mesh is self.mesh
+        return other.integration is extract and FunctionSpace(self.hierarchy).is_refinement_of(other)
+
+    def dofs_of(self, cells: Cells) -> Ints:
+        """Return the number of the face or cell that each of the given cells lies in, shape (cells.num_cells,).
+
+        Raises:
+            ValueError: If some lie in none, since they are coarser.
+        """
+        if self.hierarchy is None:
+            return cells.face
+        if cells.hierarchy is self.hierarchy:
+            return np.arange(cells.num_cells, dtype=np.int32)
+        coarse = self.cells
+        found = np.full(cells.num_cells, -1, dtype=np.int32)
+        keys = _cell_keys(cells)
+        for l in range(self.hierarchy.num_levels):
+            mine = np.flatnonzero(coarse.level == l).astype(np.int32)
+            known = _cell_keys(coarse)[mine]  # ascending, as the faces of a level are
+            ancestor = keys >> 2 * np.maximum(cells.level.astype(np.int64) - l, 0)
+            place = np.minimum(np.searchsorted(known, ancestor), known.size - 1)
+            inside = (cells.level >= l) & (known[place] == ancestor) if known.size else np.zeros(keys.size, dtype=bool)
+            found[inside] = mine[place[inside]]
+        if (found < 0).any():
+            raise ValueError(
+                f"the values of {np.count_nonzero(found < 0)} of {found.size} cells are not known: a function that is "
+                f"constant on cells goes over to finer cells only"
+            )
+        return found
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if not (isinstance(other, CellwiseSpace) and self.mesh is other.mesh and self.value_shape == other.value_shape):
+            return False
+        if self.hierarchy is None or other.hierarchy is None:
+            return self.hierarchy is other.hierarchy
+        return self.hierarchy is other.hierarchy or self.hierarchy.same_as(other.hierarchy)
+
+    def __hash__(self) -> int:
+        return hash((id(self.mesh), self.num_dofs, self.value_shape))
+
+    def __str__(self) -> str:
+        where = "control mesh" if self.hierarchy is None else f"hierarchy of {self.hierarchy.num_levels} levels"
+        return f"CellwiseSpace(values {self.value_shape}, {self.num_cells} cells of a {where})"
+
+
+def cellwise(V: FunctionSpace, value_shape: tuple[int, ...] = ()) -> CellwiseSpace:
+    """Return the space of functions that are constant on each cell of V, in the order of the cells.
+
+    They can be coefficients of forms and parts of expressions, but not test or trial functions.
+
+    Args:
+        V: The space with the cells.
+        value_shape: () for scalars, (k,) for vectors.
+    """
+    return CellwiseSpace(V.mesh, V.hierarchy, _checked_shape(value_shape))
+
+
 class Component:
     """One component of a vector-valued space; made by `FunctionSpace.sub`."""
 
@@ -172,18 +288,31 @@ class Component:
         self.component = component
 
 
+@overload
+def functionspace(
+    mesh: ControlMesh, element: ConstantElement, boundary: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL
+) -> CellwiseSpace: ...
+
+
+@overload
+def functionspace(
+    mesh: ControlMesh, element: tuple[Any, ...], boundary: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL
+) -> FunctionSpace: ...
+
+
 def functionspace(
     mesh: ControlMesh,
     element: tuple[Any, ...],
     boundary: BoundaryRule = "clamped",
     *,
     cap_level: int = CAP_LEVEL,
-) -> FunctionSpace:
+) -> FunctionSpace | CellwiseSpace:
     """Return the THCCS space on the limit surface of a control mesh.
 
     Args:
         mesh: The control mesh.
-        element: ("THCCS", 3) for scalars, ("THCCS", 3, (k,)) for vectors with k components.
+        element: ("THCCS", 3) for scalars, ("THCCS", 3, (k,)) for vectors with k components; or ("DG", 0), with a
+            shape or without, for coefficients that are constant on each face of the control mesh.
         boundary: "clamped" (full approximation order up to the boundary) or "crease" (the plain Catmull-Clark
         boundary).
         cap_level: Level at which a bicubic cap ends the cut at extraordinary vertices; deeper where refinement goes
@@ -204,6 +333,8 @@ def functionspace(
             f"rank its own mesh with comm=MPI.COMM_SELF"
         )
     value_shape = _value_shape(element)
+    if element[0] == "DG":
+        return CellwiseSpace(mesh, value_shape=value_shape)
     hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level)
     space = FunctionSpace(hierarchy, value_shape)
     check_no_folds(space.cells)
@@ -211,13 +342,26 @@ def functionspace(
 
 
 def _value_shape(element: object) -> tuple[int, ...]:
-    """Return the value shape that ("THCCS", 3[, shape]) asks for."""
-    if not isinstance(element, tuple) or not 2 <= len(element) <= 3 or element[:2] != (FAMILY, DEGREE):
-        raise ValueError(f'the element is {element!r}; it must be ("THCCS", 3), or ("THCCS", 3, (k,)) for k components')
-    shape = element[2] if len(element) == 3 else ()
+    """Return the value shape that ("THCCS", 3[, shape]) or ("DG", 0[, shape]) asks for."""
+    known = ((FAMILY, DEGREE), ("DG", 0))
+    if not isinstance(element, tuple) or not 2 <= len(element) <= 3 or element[:2] not in known:
+        raise ValueError(
+            f'the element is {element!r}; it must be ("THCCS", 3), or ("THCCS", 3, (k,)) for k components, or '
+            f'("DG", 0) for coefficients that are constant on each face of the mesh'
+        )
+    return _checked_shape(element[2] if len(element) == 3 else ())
+
+
+def _checked_shape(shape: object) -> tuple[int, ...]:
     if not isinstance(shape, tuple) or len(shape) > 1 or not all(isinstance(k, int) and k > 0 for k in shape):
         raise ValueError(f"the value shape is {shape!r}; it must be () or (k,) with k components")
     return shape
+
+
+def _cell_keys(cells: Cells) -> npt.NDArray[np.int64]:
+    """Return the key of each cell on its level, shape (num_cells,)."""
+    keys = [stage.level.keys for stage in cells.hierarchy.stages]
+    return np.concatenate([keys[l][cells.level_face[cells.level == l]] for l in range(cells.hierarchy.num_levels)])
 
 
 def _limit_points(hierarchy: Hierarchy, l: int) -> npt.NDArray[np.float64]:

@@ -15,11 +15,23 @@ import scipy.sparse as sp
 
 from thccs_fem.fem import assembly
 from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.blocks import BlockMatrix, Layout, constraints
 from thccs_fem.fem.forms import Form
-from thccs_fem.fem.linear import constrain, constraints
+from thccs_fem.fem.linear import constrain
 from thccs_fem.fem.space import FunctionSpace
 
-__all__ = ["apply_lifting", "assemble_matrix", "assemble_vector", "changed", "comm_of", "new_mat", "new_vec", "set_bc"]
+__all__ = [
+    "apply_lifting",
+    "assemble_matrix",
+    "assemble_vector",
+    "changed",
+    "comm_of",
+    "new_block_mat",
+    "new_mat",
+    "new_vec",
+    "set_bc",
+    "sharing",
+]
 
 Floats = npt.NDArray[np.float64]
 
@@ -134,20 +146,67 @@ def new_vec(array: Any, comm: Any) -> PETSc.Vec:
 
 
 def new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
-    """Return a matrix that uses the memory of A."""
+    """Return a matrix that uses the memory of A.
+
+    Args:
+        A: The values.
+        spaces: Spaces of rows and columns.
+    """
+    test, trial = spaces
+    mat = sharing(A, comm_of(test))
+    mat.setBlockSizes(test.block_size, trial.block_size)
+    return mat
+
+
+def new_block_mat(A: BlockMatrix | sp.csr_array, layout: Layout, kind: str = "mpi") -> PETSc.Mat:
+    """Return a matrix for several unknowns that uses the memory of A.
+
+    Args:
+        A: The matrix, for "nest" with its blocks.
+        layout: Its dofs.
+        kind: "mpi" for one matrix, "nest" for one of matrices.
+
+    Raises:
+        ValueError: The kind is none of these, or there is nothing to nest.
+    """
+    spaces, whole = layout.spaces, A.whole if isinstance(A, BlockMatrix) else A
+    if kind == "mpi":
+        return new_mat(whole, (spaces[0], spaces[0])) if len(spaces) == 1 else sharing(whole, comm_of(spaces[0]))
+    if kind != "nest" or not isinstance(A, BlockMatrix) or len(spaces) == 1:
+        raise ValueError(f'kind is {kind!r}; it must be "mpi", or "nest" for several unknowns')
+    A.scatter()
+    mats: Any = [  # None where there is no block, other than the stubs say
+        [None if block is None else new_mat(block, (test, trial)) for block, trial in zip(row, spaces, strict=True)]
+        for row, test in zip(A.blocks, spaces, strict=True)
+    ]
+    nest = PETSc.Mat().createNest(mats, comm=comm_of(spaces[0]))
+    nest.setAttr("blocks", A)
+    nest.assemble()
+    return nest
+
+
+def sharing(A: sp.csr_array, comm: Any) -> PETSc.Mat:
+    """Return a matrix that uses the memory of A, of whatever dofs."""
     if np.dtype(PETSc.ScalarType) != np.float64:
         raise TypeError(
             f"PETSc was built for {np.dtype(PETSc.ScalarType)}; forms here are real, double precision: use such a build"
         )
-    test, trial = spaces
     csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
-    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=comm_of(test))
-    mat.setBlockSizes(test.block_size, trial.block_size)
+    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=comm)
     mat.setAttr("values", A)
     return mat
 
 
 def changed(mat: PETSc.Mat) -> None:
-    """Tell PETSc that values were written to the memory of a matrix."""
+    """Tell PETSc that values were written to the memory of a matrix, or of that whose blocks are nested in it."""
+    if mat.getType() == "nest":
+        nested: Any = mat.getAttr("blocks")
+        nested.scatter()
+        rows, columns = mat.getNestSize()
+        for i in range(rows):
+            for j in range(columns):
+                block = mat.getNestSubMatrix(i, j)
+                if block:
+                    changed(block)
     mat.assemble()
     mat.stateIncrease()

@@ -1,4 +1,4 @@
-"""Linear problems solved by SciPy, on one rank: nothing needs to be installed for it.
+"""Linear problems solved by SciPy.
 
 Matrices with up to `LARGEST_DIRECT` entries, and all that are not symmetric, are factorised by SuperLU; for larger
 ones there are conjugate gradients with Jacobi's preconditioner, which do for second-order problems.
@@ -7,7 +7,7 @@ ones there are conjugate gradients with Jacobi's preconditioner, which do for se
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,12 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 import ufl
-from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.blocks import Conditions
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import LinearSystem, check_regular, check_residual, is_symmetric
 
-__all__ = ["LinearProblem", "conjugate_gradients", "solve"]
+__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "solve"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -35,16 +35,23 @@ class LinearProblem:
 
     Where constants are in the kernel of a, as on a closed surface without conditions, u is the solution with mean zero.
 
+    With several unknowns, a is a list of rows ``[[a00, a01], [a10, a11]]`` and L a list, None where there is no form;
+    or both are forms over a `ufl.MixedFunctionSpace`.
+
     Args:
         a: Bilinear form.
         L: Linear form.
-        bcs: Conditions; where two prescribe the same dof, the later one holds.
-        u: Function that takes the solution; None: a new one.
-        petsc_options_prefix: Ignored. It is here, as the next one, so that the import alone decides who solves.
+        bcs: Conditions; where two prescribe the same dof, the later one holds. With several unknowns they are for that
+            in whose space they are; where two are in the same one, give a list of conditions for each unknown.
+        u: Function that takes the solution, or a list of them; None: new ones.
+        load: Vector that is added to the right-hand side, as of point loads, shape (num_dofs,).
+        petsc_options_prefix: Ignored. It is here, as the next ones, so that the import alone decides who solves.
         petsc_options: Ignored.
+        kind: Ignored.
 
     Attributes:
         bcs: The conditions; others may be put in their place before the next `solve`.
+        load: The vector; likewise.
 
     Raises:
         TypeError: A form is no form, or a condition none.
@@ -53,16 +60,19 @@ class LinearProblem:
 
     def __init__(
         self,
-        a: ufl.Form | Form,
-        L: ufl.Form | Form,
+        a: ufl.Form | Form | Sequence[Sequence[ufl.Form | Form | None]],
+        L: ufl.Form | Form | Sequence[ufl.Form | Form | None],
         *,
-        bcs: Sequence[DirichletBC] = (),
-        u: Function | None = None,
+        bcs: Conditions = (),
+        u: Function | Sequence[Function] | None = None,
+        load: npt.ArrayLike | None = None,
         petsc_options_prefix: str = "",
         petsc_options: Mapping[str, Any] | None = None,
+        kind: str = "mpi",
     ):
-        self._system = LinearSystem(a, L, bcs=bcs, u=u)
+        self._system = LinearSystem(a, L, bcs=bcs, u=u, load=load)
         self.bcs = bcs
+        self.load = load
 
     @property
     def A(self) -> sp.csr_array:
@@ -75,18 +85,21 @@ class LinearProblem:
         return self._system.b
 
     @property
-    def u(self) -> Function:
-        """The solution."""
+    def u(self) -> Any:
+        """The solution: a `Function`, or a list of them."""
         return self._system.u
 
-    def solve(self) -> Function:
+    def solve(self) -> Any:
         """Assemble with the present values of coefficients, constants and conditions, and solve.
 
+        Returns:
+            `u`.
+
         Raises:
-            ValueError: The load is not zero on average, where constants are in the kernel.
+            ValueError: The load is not zero on average, where constants are in the kernel, or has another shape.
             RuntimeError: The matrix is singular, or the iteration does not converge.
         """
-        self._system.bcs = self.bcs
+        self._system.bcs, self._system.load = self.bcs, self.load
         self._system.assemble()
         return self._system.accept(solve(self._system.regular(), self._system.b))
 
@@ -133,7 +146,12 @@ def conjugate_gradients(A: sp.csr_array, b: Floats, tolerance: float) -> Floats:
     return np.asarray(x)
 
 
-def _direct(A: sp.csr_array, b: Floats) -> Floats:
+def factorised(A: sp.csr_array) -> Callable[[Floats], Floats]:
+    """Return what solves A x = b for any b, for a matrix with the pattern of a symmetric one.
+
+    Raises:
+        RuntimeError: The matrix is singular, to working precision.
+    """
     transposed = sp.csc_array((A.data, A.indices, A.indptr), shape=A.shape)  # no copy
     try:
         factors = spla.splu(
@@ -144,7 +162,15 @@ def _direct(A: sp.csr_array, b: Floats) -> Floats:
             f"SuperLU failed ({error}): the matrix is singular. See that Dirichlet conditions fix all that the "
             f"bilinear form leaves free, and that there is an integral over all of the surface"
         ) from error
-    check_regular(A, lambda r: factors.solve(r, "T"))
-    x: Floats = factors.solve(b, "T")
+
+    def solved(b: Floats) -> Floats:
+        return np.asarray(factors.solve(b, "T"))
+
+    check_regular(A, solved)
+    return solved
+
+
+def _direct(A: sp.csr_array, b: Floats) -> Floats:
+    x = factorised(A)(b)
     check_residual(A, x, b, "SuperLU")
     return x

@@ -1,0 +1,180 @@
+"""What a form must be before it is compiled: one mesh, functions with values, measures and tags that are there."""
+
+from __future__ import annotations
+
+import ufl
+from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
+from thccs_fem.mesh import ControlMesh, Domain
+from ufl.corealg.traversal import unique_pre_traversal
+from ufl.domain import extract_domains
+
+__all__ = ["MEASURES", "check_metadata", "check_no_facets", "checked_mesh"]
+
+#: What is integrated over, in FFCx's order, and its measure.
+MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
+
+# FFCx knows them on affine cells only.
+SIZES = (
+    ufl.classes.CellVolume,
+    ufl.classes.Circumradius,
+    ufl.classes.CellDiameter,
+    ufl.classes.MinCellEdgeLength,
+    ufl.classes.MaxCellEdgeLength,
+    ufl.classes.FacetArea,
+    ufl.classes.MinFacetEdgeLength,
+    ufl.classes.MaxFacetEdgeLength,
+)
+
+
+def checked_mesh(ufl_form: object) -> ControlMesh:
+    """Return the mesh of a form that has all that is needed to compile it; `forms.form` lists what is raised."""
+    form = _checked_form(ufl_form)
+    mesh = _mesh(form)
+    for integral in form.integrals():
+        _check_integral(integral, mesh)
+    _check_arguments(form)
+    _check_values(form)
+    return mesh
+
+
+def check_no_facets(ufl_form: ufl.Form) -> None:
+    """Refuse integrals over facets where pieces are not those of the surface.
+
+    Raises:
+        ValueError: If there are some.
+    """
+    measures = {MEASURES[integral.integral_type()] for integral in ufl_form.integrals()} - {"dx"}
+    if measures:
+        raise ValueError(
+            f"the form has integrals over {' and '.join(sorted(measures))}, but its spaces come from with_integration, "
+            f"which makes cells for dx alone: integrate over edges on the space it was called on"
+        )
+
+
+def check_metadata(ufl_form: ufl.Form, degree: int) -> None:
+    """Refuse rules other than that of the given degree.
+
+    Raises:
+        ValueError: If an integral asks for one.
+    """
+    for integral in ufl_form.integrals():
+        metadata = integral.metadata()
+        if metadata.get("quadrature_degree", degree) != degree or "quadrature_rule" in metadata:
+            raise ValueError(
+                f"the metadata {metadata} ask for a rule of their own, but the cells of the space are made for degree "
+                f"{degree} alone: leave them out, or integrate on a space without with_integration"
+            )
+
+
+def _checked_form(ufl_form: object) -> ufl.Form:
+    if not isinstance(ufl_form, ufl.Form | ufl.ZeroBaseForm):
+        given = type(ufl_form).__name__
+        raise TypeError(f"form needs a sum of UFL integrals, got {given}: is there a * ufl.dx missing?")
+    integrals = () if isinstance(ufl_form, ufl.ZeroBaseForm) else ufl_form.integrals()
+    if all(isinstance(integral.integrand(), ufl.classes.Zero) for integral in integrals):
+        raise ValueError(
+            "the form is zero, so that nothing is known of its functions: for a zero right-hand side write "
+            "fem.Constant(msh, 0.0) * v * ufl.dx"
+        )
+    assert isinstance(ufl_form, ufl.Form)  # another one is empty
+    return ufl_form
+
+
+def _mesh(ufl_form: ufl.Form) -> ControlMesh:
+    """Return the mesh of all measures, functions, constants and coordinates."""
+    domains = {*ufl_form.ufl_domains(), *(d for integral in ufl_form.integrals() for d in extract_domains(integral))}
+    if len(domains) != 1:
+        raise ValueError(f"the form has measures or functions on {len(domains)} meshes: all must be on one")
+    (domain,) = domains
+    if not isinstance(domain, Domain):
+        raise ValueError(
+            f"the form is on {domain!r}, which is not the domain of a control mesh: use functions of a space from "
+            f"fem.functionspace(msh, ...), or dx(domain=msh)"
+        )
+    return domain.control_mesh
+
+
+def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
+    """Refuse what is not integrated here, or would be integrated wrongly."""
+    kind, ids = integral.integral_type(), integral.subdomain_id()
+    if kind not in MEASURES:
+        measure = ufl.measure.integral_type_to_measure_name[kind]
+        raise NotImplementedError(
+            f"the form has an integral over {measure} ({kind}); there are dx, ds and dS only. Values at points come "
+            f"from Function.eval and fem.point_values."
+        )
+    if integral.subdomain_data() is not None:
+        tags = "face_tags=tags" if kind == "cell" else "edge_tags={(i, j): tag}"
+        raise ValueError(
+            f"the measure has subdomain_data; tags belong to the mesh here: ControlMesh(..., {tags}) and "
+            f"{MEASURES[kind]}(tag)"
+        )
+    known = _known_tags(mesh, kind)
+    for tag in ids if isinstance(ids, tuple) else (ids,):
+        if tag != "everywhere" and not (tag >= 0 and tag in known):
+            of_what = {"cell": "the mesh", "exterior_facet": "edges on its boundary"}.get(kind, "edges inside it")
+            raise ValueError(
+                f"the form has {MEASURES[kind]}({tag!r}), but tags are from 0, and those of {of_what} are "
+                f"{sorted(known)}"
+            )
+    for node in unique_pre_traversal(integral.integrand()):
+        if isinstance(node, SIZES):
+            raise ValueError(
+                f"the form has {type(node).__name__}, which can't be computed on curved cells: use "
+                f"h = fem.cell_sizes(V), the root of the area of each cell, in dS avg(h)"
+            )
+        if isinstance(node, ufl.classes.FacetNormal) and kind == "cell":
+            raise ValueError("the form has FacetNormal in dx: the normal of the boundary is known in ds and dS only")
+        if isinstance(node, ufl.classes.Restricted) and kind != "interior_facet":
+            raise ValueError(
+                f"the form has {node} in {MEASURES[kind]}: jump, avg, '+' and '-' have a meaning in dS alone"
+            )
+
+
+def _known_tags(mesh: ControlMesh, kind: str) -> set[int]:
+    """Return the tags that an integral can have."""
+    if kind == "cell":
+        return {int(t) for t in mesh.face_tags}
+    tags = list(mesh.edge_tags.values())
+    pairs = [list(pair) for pair in mesh.edge_tags]
+    on_boundary = mesh.edge_faces[mesh.edge_indices(pairs), 1] < 0 if pairs else []
+    return {tag for tag, outer in zip(tags, on_boundary, strict=True) if outer == (kind == "exterior_facet")}
+
+
+def _check_arguments(ufl_form: ufl.Form) -> None:
+    arguments = ufl_form.arguments()
+    if len({argument.number() for argument in arguments}) < len(arguments):
+        raise ValueError(
+            f"the form has the test or trial functions {', '.join(map(str, arguments))} of several blocks at once: "
+            f"take it apart by ufl.extract_blocks(F), and compile each block"
+        )
+    for argument in arguments:
+        space = argument.ufl_function_space()
+        if isinstance(space, CellwiseSpace):
+            raise ValueError(
+                f"{argument} is constant on each cell, but test and trial functions must be in spaces from "
+                f'fem.functionspace(msh, ("THCCS", 3)): integrals over each cell come from fem.assemble_cells'
+            )
+        _check_space(argument, space)
+    for coefficient in ufl_form.coefficients():
+        if not isinstance(coefficient.ufl_function_space(), CellwiseSpace):
+            _check_space(coefficient, coefficient.ufl_function_space())
+
+
+def _check_space(function: ufl.core.expr.Expr, space: ufl.FunctionSpace) -> None:
+    if not isinstance(space, FunctionSpace):
+        raise ValueError(
+            f"{function} has the element {space.ufl_element()!r}, but all arguments and functions of a form must be in "
+            f'spaces from fem.functionspace(msh, ("THCCS", 3)): use fem.project to carry others over'
+        )
+
+
+def _check_values(ufl_form: ufl.Form) -> None:
+    """Refuse UFL's own coefficients and constants."""
+    for coefficient in ufl_form.coefficients():
+        if not isinstance(coefficient, Function):
+            raise TypeError(f"{coefficient} is a {type(coefficient).__name__} without values: use fem.Function(V)")
+    for constant in ufl_form.constants():
+        if not isinstance(constant, Constant):
+            raise TypeError(f"{constant} is a {type(constant).__name__} without a value: use fem.Constant(msh, value)")

@@ -1,0 +1,159 @@
+"""Eigenvalue problems of symmetric weak forms, whatever solves them.
+
+Prescribed dofs are left out of the matrices: rows of the identity in their place would add eigenvalues of their own.
+The spectrum is transformed by (A - s M)^-1, which needs a shift s at which that matrix is regular.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+import ufl
+from thccs_fem.fem.assembly import assemble_matrix
+from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.forms import Form, form
+from thccs_fem.fem.function import Function
+from thccs_fem.fem.linear import constraints, is_symmetric
+from thccs_fem.subdivision import Ints
+
+__all__ = ["EigenSystem", "start_vector"]
+
+Floats = npt.NDArray[np.float64]
+
+AWAY = 0.1  # how far the shift goes below the target, in units of the Rayleigh quotient of a long wave
+EQUAL = 1e-6  # relative difference of coefficients that count as equally large when the sign is chosen
+
+
+class EigenSystem:
+    """The equations A x = lambda M x of two symmetric forms: see the problems of `fem.scipy` for the arguments.
+
+    Attributes:
+        a: Compiled bilinear form.
+        m: Compiled mass form.
+        bcs: Conditions; others may be put in their place before the next `assemble`.
+        num_eigenvalues: How many eigenvalues are wanted.
+        target: They are the nearest to this number.
+        free: Dofs that no condition prescribes, shape (n,).
+        A: Matrix of a, without prescribed dofs, shape (n, n).
+        M: That of m.
+    """
+
+    def __init__(
+        self,
+        a: ufl.Form | Form,
+        m: ufl.Form | Form | None = None,
+        *,
+        bcs: Sequence[DirichletBC] = (),
+        num_eigenvalues: int = 6,
+        target: float = 0.0,
+    ):
+        self.a = form(a)
+        if self.a.rank != 2 or self.a.spaces[0] != self.a.spaces[1]:
+            raise ValueError(
+                f"a has arguments in {[str(V) for V in self.a.spaces]}: give a bilinear form, in a trial and a test "
+                f"function of the same space"
+            )
+        V = self.a.spaces[1]
+        mass = ufl.inner(ufl.TrialFunction(V), ufl.TestFunction(V)) * ufl.dx
+        self.m = form(mass if m is None else m)
+        if self.m.spaces != self.a.spaces:
+            raise ValueError(f"m has arguments in {[str(V) for V in self.m.spaces]}, but those of a are in {V}")
+        if num_eigenvalues < 1:
+            raise ValueError(f"num_eigenvalues is {num_eigenvalues}: ask for one or more")
+        self.bcs = bcs
+        self.num_eigenvalues = num_eigenvalues
+        self.target = target
+        self.free: Ints = np.zeros(0, dtype=np.int32)
+        self.A = self.M = sp.csr_array((0, 0))
+        constraints(bcs, V)  # says early what is wrong with them
+
+    def assemble(self) -> None:
+        """Assemble both matrices with the present values of coefficients, constants and conditions.
+
+        Raises:
+            ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
+                as many eigenvalues as wanted.
+        """
+        V = self.a.spaces[1]
+        dofs, values = constraints(self.bcs, V)
+        if values.any():
+            raise ValueError(
+                f"conditions prescribe values up to {np.abs(values).max():g}: eigenfunctions vanish where something is "
+                f"prescribed, so prescribe 0.0"
+            )
+        self.free = np.setdiff1d(np.arange(V.num_dofs, dtype=np.int32), dofs)
+        if self.num_eigenvalues >= self.free.size:
+            raise ValueError(
+                f"{self.num_eigenvalues} eigenvalues are wanted of {self.free.size} dofs without a condition: refine "
+                f"the space, or ask for fewer"
+            )
+        self.A, self.M = (self._matrix(compiled) for compiled in (self.a, self.m))
+        for name, matrix in (("a", self.A), ("m", self.M)):
+            if not is_symmetric(matrix):
+                raise ValueError(
+                    f"{name} is not symmetric, so that eigenvalues may be complex: only symmetric forms are implemented"
+                )
+        if not (self.M.diagonal() > 0.0).all():
+            raise ValueError(
+                "m is not positive: eigenvalues need a norm. If a is positive, swap the forms: the eigenvalues become "
+                "their inverses"
+            )
+
+    def shifted(self, shift: float) -> sp.csr_array:
+        """Return A - shift M."""
+        return sp.csr_array(self.A - shift * self.M) if shift else self.A
+
+    def shift_beside(self) -> float:
+        """Return a number a little below the target, for a target that is itself an eigenvalue.
+
+        What is little, the Rayleigh quotient of half a wave tells that is as long as the surface: it is of the size of
+        the first eigenvalues that are not zero, whatever the order of the form and the units of its coefficients.
+        """
+        V = self.a.spaces[1]
+        points = V.reference_points
+        extents = np.ptp(points, axis=0)
+        along = points[:, int(np.argmax(extents))]
+        wave = np.cos(np.pi * (along - along.min()) / extents.max())
+        w = np.repeat(wave, V.block_size)[self.free]
+        return self.target - AWAY * abs(float(w @ (self.A @ w) / (w @ (self.M @ w))))
+
+    def accept(self, eigenvalues: Floats, vectors: Floats, solver: str) -> tuple[Floats, list[Function]]:
+        """Return eigenvalues in ascending order, and their functions with m-norm 1 and a sign of our choice.
+
+        Args:
+            eigenvalues: Those that converged, shape (k,).
+            vectors: Eigenvectors, shape (n, k).
+            solver: Who found them, for messages.
+
+        Raises:
+            RuntimeError: There are fewer than wanted.
+        """
+        if eigenvalues.size < self.num_eigenvalues:
+            raise RuntimeError(
+                f"{solver} found {eigenvalues.size} of {self.num_eigenvalues} eigenvalues near {self.target:g}. What "
+                f"may help: more iterations, a larger subspace (eps_ncv), or a target nearer to what is wanted"
+            )
+        nearest = np.argsort(np.abs(eigenvalues - self.target), kind="stable")[: self.num_eigenvalues]
+        order = nearest[np.argsort(eigenvalues[nearest], kind="stable")]
+        return eigenvalues[order], [self._function(vectors[:, i]) for i in order]
+
+    def _function(self, vector: Floats) -> Function:
+        """Return an eigenfunction; the first of its largest coefficients is positive."""
+        x = vector / np.sqrt(vector @ (self.M @ vector))
+        largest = np.flatnonzero(np.abs(x) >= (1.0 - EQUAL) * np.abs(x).max())[0]
+        function = Function(self.a.spaces[1])
+        function.x.array[self.free] = x * np.sign(x[largest])
+        return function
+
+    def _matrix(self, compiled: Form) -> sp.csr_array:
+        whole = assemble_matrix(compiled)
+        return whole if self.free.size == whole.shape[0] else sp.csr_array(whole[self.free][:, self.free])
+
+
+def start_vector(M: sp.csr_array) -> Floats:
+    """Return what Krylov methods start from: the same at every call, with a part along every eigenvector."""
+    return np.asarray(M @ np.random.default_rng(0).standard_normal(M.shape[0]))

@@ -1,0 +1,150 @@
+"""Eigenvalue problems solved by any EPS of SLEPc."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from petsc4py import PETSc
+from slepc4py import SLEPc
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+import ufl
+from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.eigen import EigenSystem, start_vector
+from thccs_fem.fem.forms import Form
+from thccs_fem.fem.function import Function
+from thccs_fem.fem.linear import check_regular
+from thccs_fem.fem.petsc.linear import factorises, solved
+from thccs_fem.fem.petsc.matrices import comm_of, new_vec, sharing
+from thccs_fem.fem.petsc.options import Options
+
+__all__ = ["EigenProblem"]
+
+Floats = npt.NDArray[np.float64]
+
+TOLERANCE = 1e-12  # of eigenvalues, relative: eigenfunctions are then right to its root
+
+
+class EigenProblem:
+    """Find the numbers lambda and functions u with a(u, v) = lambda m(u, v) for all v, by an EPS of SLEPc.
+
+    Options are those in `petsc_options`, and those on the command line (and in PETSc's other sources) with the prefix;
+    and what is set in code on `solver`. If nothing is said, the eigenvalues are those nearest to a target, by the
+    Krylov-Schur method with shift and invert (``st_type`` "sinvert"), factorised by MUMPS if PETSc has it, to
+    ``eps_tol`` 1e-12. Where the target is an eigenvalue, as zero on a closed surface, the shift is moved a little below
+    it.
+
+    Args:
+        a: Symmetric bilinear form.
+        m: Symmetric positive bilinear form; None: the inner product of L2.
+        bcs: Conditions, all with value zero. Their dofs are left out of the problem.
+        num_eigenvalues: How many are wanted.
+        target: Number that they are nearest to.
+        petsc_options_prefix: What distinguishes the options of this problem, usually with "_" at the end.
+        petsc_options: Options without the prefix, as ``{"eps_ncv": 40}``. They hold for this problem, and before those
+            on the command line.
+
+    Attributes:
+        bcs: The conditions; others may be put in their place before the next `solve`.
+
+    Raises:
+        TypeError: A form is no form, or a condition none.
+        ValueError: The forms are not bilinear forms on one space, a condition is in another one, no eigenvalue is
+            wanted, or the prefix is empty.
+    """
+
+    def __init__(
+        self,
+        a: ufl.Form | Form,
+        m: ufl.Form | Form | None = None,
+        *,
+        bcs: Sequence[DirichletBC] = (),
+        num_eigenvalues: int = 6,
+        target: float = 0.0,
+        petsc_options_prefix: str,
+        petsc_options: Mapping[str, Any] | None = None,
+    ):
+        self._options = Options(petsc_options_prefix, petsc_options)
+        self._system = EigenSystem(a, m, bcs=bcs, num_eigenvalues=num_eigenvalues, target=target)
+        self.bcs = bcs
+        self._comm = comm_of(self._system.a.spaces[0])
+        self._solver = SLEPc.EPS().create(self._comm)
+        self._solver.setOptionsPrefix(petsc_options_prefix)
+        self._solver.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+        self._solver.setDimensions(num_eigenvalues)
+        self._solver.setTolerances(tol=TOLERANCE)
+        self._solver.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
+        transform = self._solver.getST()
+        transform.setType(SLEPc.ST.Type.SINVERT)
+        transform.getKSP().setType("preonly")
+        pc = transform.getKSP().getPC()
+        pc.setType("cholesky")
+        if PETSc.Sys.hasExternalPackage("mumps"):
+            pc.setFactorSolverType("mumps")
+        with self._options.in_place():
+            self._solver.setFromOptions()
+
+    @property
+    def solver(self) -> SLEPc.EPS:
+        """The EPS."""
+        return self._solver
+
+    def solve(self) -> tuple[Floats, list[Function]]:
+        """Assemble with the present values of coefficients, constants and conditions, and solve.
+
+        Returns:
+            Eigenvalues in ascending order, shape (num_eigenvalues,), and their functions, m-orthonormal. The first of
+            the largest coefficients of each is positive; of functions with one eigenvalue the choice is the solver's.
+
+        Raises:
+            ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
+                as many eigenvalues as wanted.
+            RuntimeError: Not all converge.
+        """
+        system, solver = self._system, self._solver
+        system.bcs = self.bcs
+        system.assemble()
+        A, M = (sharing(matrix, self._comm) for matrix in (system.A, system.M))
+        with self._options.in_place():
+            solver.setOperators(A, M)
+            solver.setInitialSpace([new_vec(start_vector(system.M), self._comm)])
+            solver.setTarget(system.target)
+            solver.getST().setShift(self._shift())
+            solver.solve()
+        self._options.warn_unused()
+        values, vectors = self._converged(system.A)
+        return system.accept(
+            values, vectors, f"SLEPc's {solver.getType()}, after {solver.getIterationNumber()} iterations,"
+        )
+
+    def _shift(self) -> float:
+        """Return a shift at which the shifted matrix can be factorised."""
+        system, transform = self._system, self._solver.getST()
+        pc = transform.getKSP().getPC()
+        if transform.getType() != SLEPc.ST.Type.SINVERT or not factorises(pc):
+            return system.target
+        shifted = system.shifted(system.target)
+        mat = sharing(shifted, self._comm)
+        trial = PETSc.PC().create(self._comm)
+        trial.setOptionsPrefix(pc.getOptionsPrefix())
+        trial.setType(pc.getType())
+        trial.setFactorSolverType(pc.getFactorSolverType() or "petsc")
+        trial.setOperators(mat)
+        try:
+            trial.setUp()
+            check_regular(shifted, lambda r: solved(trial.getFactorMatrix(), r))
+        except (RuntimeError, PETSc.Error):  # PETSc's own is one that factors are missing
+            return system.shift_beside()
+        return system.target
+
+    def _converged(self, A: sp.csr_array) -> tuple[Floats, Floats]:
+        """Return the eigenvalues that converged, and their vectors as columns."""
+        solver, n = self._solver, A.shape[0]
+        count = solver.getConverged()
+        vectors = np.zeros((count, n))
+        values = np.array([solver.getEigenpair(i, new_vec(row, self._comm)) for i, row in enumerate(vectors)])
+        return values.real, vectors.T

@@ -1,0 +1,430 @@
+"""Problems in time, F(t, u, du/dt; v) = 0 for all v, stepped by a TS of PETSc.
+
+A change of space between two steps needs a new TS, and TSBDF takes no history from outside: it would start again, with
+half a step of order one, which costs an order where spaces change often. So a new TS is led through the last step
+again, with equations that always hold, and is then given the states before and after that step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, get_args
+
+from petsc4py import PETSc
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+import ufl
+from thccs_fem.fem import assembly
+from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.forms import form
+from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.linear import constraints, is_fourth_order
+from thccs_fem.fem.nonlinear import RELATIVE
+from thccs_fem.fem.petsc import linear, nonlinear
+from thccs_fem.fem.petsc.matrices import changed, comm_of, new_mat, new_vec
+from thccs_fem.fem.petsc.options import Options
+from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.subdivision import Ints
+from ufl.algorithms import expand_derivatives
+
+__all__ = ["TimeProblem"]
+
+Floats = npt.NDArray[np.float64]
+Scheme = Literal["implicit_euler", "bdf2", "crank_nicolson"]
+Conditions = Sequence[DirichletBC] | Callable[[FunctionSpace, float], Sequence[DirichletBC]]
+Transfer = Callable[[Function, FunctionSpace], Function]
+
+TYPES = {"implicit_euler": "beuler", "bdf2": "bdf", "crank_nicolson": "cn"}
+ADAPT = "ts_adapt_type"  # TSBDF would adapt its steps if nothing is said
+SAME_TIME = 1e-9  # of a step: what is left at the end is no step of its own, and no reason for a shorter one
+UNLIMITED = 2**31 - 2  # steps: one less than what PETSc takes for "not said"
+
+
+class TimeProblem:
+    """Find u(t) with F(t, u, du/dt; v) = 0 for all v, and Dirichlet conditions, one time step after the other.
+
+    The schemes are "implicit_euler" (order 1; TSBEULER), "bdf2" (order 2, damps what is stiff; TSBDF) and
+    "crank_nicolson" (order 2, the trapezoidal rule, hardly damps what is stiff; TSCN). All of them keep the integral of
+    u, to the accuracy of the solvers, where F is the integral of du/dt for v = 1.
+
+    Steps have the size `dt`, which may be set anew between two of them; with the option ``ts_adapt_type`` "basic" PETSc
+    chooses it, to ``ts_rtol`` and ``ts_atol``. Options are those in `petsc_options`, and those on the command line with
+    the prefix: of the TS, its SNES and its KSP. If nothing is said, ``snes_rtol`` is 1e-10, and linear systems are
+    solved as by `NonlinearProblem`. The matrix is assembled and factorised anew only where a coefficient, a constant or
+    the step size has changed: once for all steps of the heat equation. Its rows of prescribed dofs are the identity's,
+    but not its columns, since the values change.
+
+    Args:
+        F: Form with a test function, in u and its derivative.
+        u: The unknown, with its values at the start.
+        udot: A function of the same space that stands for the derivative of u in F.
+        dt: Size of a step.
+        scheme: One of the three.
+        t: The time in F, with its value at the start; None: it is not in F, and starts at 0.
+        bcs: Conditions; where they change, a function ``bcs(V, time)`` that returns them, called with `t` set to that
+            time. Prescribed values replace those of u at the start, and where the space changes.
+        petsc_options_prefix: What distinguishes the options of this problem, usually with "_" at the end.
+        petsc_options: Options without the prefix, as ``{"snes_rtol": 1e-12}``. They hold for this problem, and before
+            those on the command line.
+
+    Raises:
+        TypeError: F is no form, or a condition none.
+        ValueError: F has not one test function, in the space of u and udot, or no udot; a condition is in another
+            space; dt is not positive; the scheme is unknown, or "crank_nicolson" where the terms with udot have u, udot
+            or t in other factors; or the prefix is empty.
+    """
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: Function,
+        udot: Function,
+        *,
+        dt: float,
+        scheme: Scheme = "bdf2",
+        t: Constant | None = None,
+        bcs: Conditions = (),
+        petsc_options_prefix: str,
+        petsc_options: Mapping[str, Any] | None = None,
+    ):
+        self._given_options = petsc_options or {}
+        self._options = Options(petsc_options_prefix, petsc_options)
+        if not self._options.have(ADAPT):
+            self._options = Options(petsc_options_prefix, {ADAPT: "none", **self._given_options})
+        if scheme not in get_args(Scheme):
+            raise ValueError(f"the scheme is {scheme!r}; it must be one of {', '.join(get_args(Scheme))}")
+        t = Constant(u.function_space.mesh, 0.0) if t is None else t
+        self._equations = _Equations(F, u, udot, t, bcs)
+        if scheme == "crank_nicolson":
+            self._equations.check_constant_mass()
+        self._scheme: Scheme = scheme
+        self._before: tuple[float, Floats] | None = None  # time and values before the last step
+        self._ts = self._stepper(float(t), 0, _checked(dt))
+
+    @property
+    def u(self) -> Function:
+        """The solution at `time`. The next step starts from its values, also where they were changed from outside."""
+        return self._equations.u
+
+    @property
+    def udot(self) -> Function:
+        """What stands for the derivative of u, with the values at which F was last evaluated."""
+        return self._equations.udot
+
+    @property
+    def time(self) -> float:
+        """The time of u."""
+        return self._ts.getTime()
+
+    @property
+    def step_number(self) -> int:
+        """Number of steps since the start, in whatever spaces."""
+        return self._ts.getStepNumber()
+
+    @property
+    def dt(self) -> float:
+        """Size of the next step."""
+        return self._ts.getTimeStep()
+
+    @dt.setter
+    def dt(self, dt: float) -> None:
+        self._ts.setTimeStep(_checked(dt))
+
+    @property
+    def solver(self) -> PETSc.TS:
+        """The TS; another one after a step that failed."""
+        return self._ts
+
+    def step(self) -> Function:
+        """Go one step forward and return u.
+
+        Raises:
+            RuntimeError: A solver fails; the message has the reasons of TS, SNES and KSP. Time and u are those before
+                the step, which may be tried again with a smaller `dt`.
+        """
+        ts, x = self._ts, self._ts.getSolution()
+        if not np.array_equal(self.u.x.array, _values(x)):  # changed from outside: what was before is no history
+            self._before = None
+            ts.restartStep()
+        if self._before is None:
+            x.array = self._equations.with_prescribed(self.u.x.array, self.time)
+        self._equations.forget()
+        number, dt, before = self.step_number, self.dt, (self.time, _values(x).copy())
+        try:
+            with self._options.in_place():
+                ts.step()
+            reason: Any = ts.getConvergedReason()  # an int, other than the stubs say
+            if reason < 0 or not np.isfinite(_values(x)).all():
+                where = f"in the step from t = {before[0]:g} with dt = {dt:g}"
+                raise RuntimeError(f"PETSc's {ts.getType()} failed {where}: {_why(ts)}")
+        except Exception as error:
+            self._equations.accept(*before)
+            self._ts = self._stepper(before[0], number, dt)
+            if isinstance(error, PETSc.Error) and error.__cause__ is not None:  # what bcs raised
+                raise error.__cause__ from None
+            raise
+        self._before = before
+        self._equations.accept(self.time, _values(x))
+        ts.monitor(self.step_number, self.time, x)
+        self._options.warn_unused()
+        return self.u
+
+    def steps(self, until: float) -> Iterator[Function]:
+        """Step to a time and yield u after each step; the last one is shortened to end there.
+
+        Raises:
+            RuntimeError: See `step`.
+        """
+        while (left := until - self.time) > SAME_TIME * self.dt:
+            dt = self.dt
+            is_shorter = left < (1.0 - SAME_TIME) * dt  # else the matrix would be another one for a rounding error
+            if is_shorter:
+                self.dt = left
+            self.step()
+            if is_shorter:
+                self.dt = dt
+            yield self.u
+
+    def solve(self, until: float) -> Function:
+        """Step to a time and return u there.
+
+        Raises:
+            RuntimeError: See `step`.
+        """
+        for _ in self.steps(until):
+            pass
+        return self.u
+
+    def with_space(self, V: FunctionSpace, transfer: Transfer, *, bcs: Conditions | None = None) -> TimeProblem:
+        """Return the problem that goes on from here in another space; this one stays as it is.
+
+        In F, u, udot and the test function are replaced by those of V. The state before the last step is carried over
+        like u, so that BDF2 goes on as if nothing had happened, and keeps its order.
+
+        Args:
+            V: The space, with values of the same shape.
+            transfer: Carries a function to V, as `adapt.transfer`.
+            bcs: Conditions in V; None: the function ``bcs(V, time)`` that this problem has, or none.
+
+        Raises:
+            ValueError: This problem has conditions in a list, and none are given for V; or as for the constructor.
+        """
+        equations = self._equations
+        if bcs is None and not callable(equations.bcs) and len(equations.bcs):
+            raise ValueError(
+                "the conditions are a list for the dofs of the old space: give bcs=[...] with those of the new one, or "
+                "make the problem with a function bcs(V, time)"
+            )
+        problem = TimeProblem(
+            *equations.replaced(transfer(self.u, V)),
+            dt=self.dt,
+            scheme=self._scheme,
+            t=equations.t,
+            bcs=equations.bcs if bcs is None else bcs,
+            petsc_options_prefix=self._options.prefix,
+            petsc_options=self._given_options,
+        )
+        problem._options = self._options
+        if self._before is not None:
+            time, before = self._before[0], self.u.copy()
+            before.x.array = self._before[1]
+            problem._before = time, problem._equations.with_prescribed(transfer(before, V).x.array, time)
+        problem._equations.accept(self.time, problem._equations.with_prescribed(problem.u.x.array, self.time))
+        problem._ts = problem._stepper(self.time, self.step_number, self.dt)
+        return problem
+
+    # ---- The TS
+
+    def _stepper(self, time: float, number: int, dt: float) -> PETSc.TS:
+        """Return a TS that goes on from u as if it had made the step before itself."""
+        ts = PETSc.TS().create(comm_of(self.u.function_space))
+        ts.setOptionsPrefix(self._options.prefix)
+        ts.setType(TYPES[self._scheme])
+        ts.setErrorIfStepFails(False)
+        ts.setMaxSteps(UNLIMITED)
+        ts.setSolution(new_vec(self.u.x.array.copy(), ts.comm))
+        ts.setIJacobian(self._equations.jacobian, self._equations.A)
+        if self._before is not None and self._scheme == "bdf2":
+            self._replay(ts, time, number)
+        ts.setIFunction(self._equations.residual, new_vec(np.zeros_like(self.u.x.array), ts.comm))
+        snes = ts.getSNES()
+        snes.setTolerances(rtol=RELATIVE)
+        snes.getKSP().setTolerances(rtol=linear.TOLERANCE)
+        if not self._options.have("ksp_type", "pc_type"):
+            linear.choose(snes.getKSP(), self._equations.A, False, is_fourth_order([[self._equations.derivative]]))
+        with self._options.in_place():
+            ts.setFromOptions()
+        ts.setTime(time)
+        ts.setStepNumber(number)
+        ts.setTimeStep(dt)
+        return ts
+
+    def _replay(self, ts: PETSc.TS, time: float, number: int) -> None:
+        """Lead a TS through the last step: it keeps the state before the step, and u takes the place of the result."""
+        assert self._before is not None  # who calls has looked
+        x = ts.getSolution()
+        ts.setIFunction(lambda ts, t, u, udot, F: F.set(0.0), x.duplicate())
+        with Options(self._options.prefix, {ADAPT: "none"}).in_place():
+            ts.setFromOptions()
+        ts.setTime(self._before[0])
+        ts.setStepNumber(number - 1)
+        ts.setTimeStep(time - self._before[0])
+        x.array = self._before[1]
+        ts.step()
+        x.array = self.u.x.array
+
+
+class _Equations:
+    """F and its derivative at any time and state, with conditions, as callbacks of a TS.
+
+    Args:
+        F: As for `TimeProblem`.
+        u: The unknown, which takes the states that F is evaluated at.
+        udot: What takes their derivatives.
+        t: What takes the time.
+        bcs: As for `TimeProblem`.
+
+    Attributes:
+        derivative: The compiled derivative of F, with udot changing faster than u by a constant.
+        A: Its matrix, as last assembled.
+    """
+
+    def __init__(self, F: ufl.Form, u: Function, udot: Function, t: Constant, bcs: Conditions):
+        V = u.function_space
+        self._F, self._test = F, _test_function(F, u, udot)
+        self.u, self.udot, self.t, self.bcs = u, udot, t, bcs
+        self._form = form(F)
+        self._shift = Constant(V.mesh, 1.0)
+        with_degrees, trial = self._form.ufl_form, ufl.TrialFunction(V)  # the same quadrature for the derivative
+        self._mass = expand_derivatives(ufl.derivative(with_degrees, udot, trial))
+        if self._mass.empty():
+            raise ValueError(
+                "F does not contain udot: write the derivative of u with the function that is given as udot"
+            )
+        stiffness = expand_derivatives(ufl.derivative(with_degrees, u, trial))
+        self.derivative = form(stiffness + self._shift * self._mass)
+        self._values = assembly.assemble_matrix(self.derivative)
+        self._at: list[Floats] = []  # what the matrix was assembled with
+        self.A = new_mat(self._values, self.derivative.spaces)
+        self._prescribed: tuple[float, Ints, Floats] | None = None
+
+    def replaced(self, u: Function) -> tuple[ufl.Form, Function, Function]:
+        """Return the form for an unknown in another space, with the unknown and its derivative."""
+        V = u.function_space
+        udot = Function(V, self.udot.name)
+        return ufl.replace(self._F, {self.u: u, self.udot: udot, self._test: ufl.TestFunction(V)}), u, udot
+
+    def check_constant_mass(self) -> None:
+        """Raise if the terms with udot are others than a constant matrix times udot."""
+        changing = {self.u, self.udot, self.t} & {*self._mass.coefficients(), *self._mass.constants()}
+        if changing:
+            raise ValueError(
+                f"the terms with udot depend on {', '.join(sorted(map(str, changing)))}, where the trapezoidal rule is "
+                f'not of order 2: use scheme="bdf2", or divide by what stands before udot'
+            )
+
+    def with_prescribed(self, values: Floats, time: float) -> Floats:
+        """Return values of u, with those in place that are prescribed at a time."""
+        dofs, prescribed = self._conditions(time)
+        values = values.copy()
+        values[dofs] = prescribed
+        return values
+
+    def accept(self, time: float, values: Floats) -> None:
+        """Give u its values at a time."""
+        self.t.value = time
+        self.u.x.array = values
+
+    def residual(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, F: PETSc.Vec) -> None:
+        """Evaluate F; for prescribed dofs u minus what is prescribed."""
+        self._set(t, u, udot)
+        values = assembly.assemble_vector(self._form)
+        dofs, prescribed = self._conditions(t)
+        values[dofs] = self.u.x.array[dofs] - prescribed
+        F.array = values
+
+    def jacobian(
+        self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, J: PETSc.Mat, P: PETSc.Mat
+    ) -> None:
+        """Assemble the derivative where it is not what it was; udot changes `shift` times as fast as u."""
+        self._set(t, u, udot)
+        self._shift.value = shift
+        dofs, _ = self._conditions(t)
+        at = [f.x.array for f in self.derivative.coefficients] + [c.value for c in self.derivative.constants] + [dofs]
+        if len(at) != len(self._at) or not all(map(np.array_equal, at, self._at)):
+            self._at = [values.copy() for values in at]
+            assembly.assemble_matrix(self._values, self.derivative)
+            _set_rows_of_identity(self._values, dofs)
+            changed(self.A)
+
+    def forget(self) -> None:
+        """Have conditions found anew: who prescribes them may have changed his mind."""
+        self._prescribed = None
+
+    def _set(self, t: float, u: PETSc.Vec, udot: PETSc.Vec) -> None:
+        self.accept(t, _values(u))
+        self.udot.x.array = _values(udot)
+
+    def _conditions(self, time: float) -> tuple[Ints, Floats]:
+        """Return the prescribed dofs and values at a time, which need not be found twice."""
+        if self._prescribed is None or (self._prescribed[0] != time and callable(self.bcs)):
+            self.t.value = time
+            V = self.u.function_space
+            self._prescribed = time, *constraints(self.bcs(V, time) if callable(self.bcs) else self.bcs, V)
+        return self._prescribed[1:]
+
+
+def _values(x: PETSc.Vec) -> Floats:
+    """Return the values of a vector, not to be changed."""
+    values: Any = x.array_r  # float64, which new_mat has checked
+    return values
+
+
+def _checked(dt: float) -> float:
+    if not (dt > 0.0 and math.isfinite(dt)):
+        raise ValueError(f"dt is {dt}: steps go forward, give a positive size")
+    return dt
+
+
+def _test_function(F: ufl.Form, u: Function, udot: Function) -> ufl.Argument:
+    """Return the test function of F, where all is in one space."""
+    if not isinstance(F, ufl.Form):
+        raise TypeError(f"F is a {type(F).__name__}: give a UFL form, a sum of integrals with a test function")
+    V = u.function_space
+    if udot.function_space != V:
+        raise ValueError(f"u is in {V}, but udot in {udot.function_space}: make it with fem.Function(u.function_space)")
+    arguments = F.arguments()
+    if len(arguments) != 1 or arguments[0].ufl_function_space() != V:
+        raise ValueError(
+            f"F has the arguments {arguments}: it needs a test function in {V}, the space of u, and no other"
+        )
+    return arguments[0]
+
+
+def _set_rows_of_identity(A: sp.csr_array, dofs: Ints) -> None:
+    prescribed = np.zeros(A.shape[0], dtype=bool)
+    prescribed[dofs] = True
+    rows = np.repeat(np.arange(A.shape[0], dtype=np.int32), np.diff(A.indptr))
+    A.data[prescribed[rows]] = 0.0
+    A.data[prescribed[rows] & (rows == A.indices)] = 1.0
+
+
+def _why(ts: PETSc.TS) -> str:
+    """Return why a step failed, and what may help."""
+    snes = ts.getSNES()
+    reason: Any = snes.getConvergedReason()  # an int, other than the stubs say
+    name = nonlinear.REASONS.get(reason)
+    if name == "DIVERGED_LINEAR_SOLVE":
+        ksp_reason: Any = snes.getKSP().getConvergedReason()
+        return f"{name}, {linear.failure(snes.getKSP())}. {linear.help_for(ksp_reason)}"
+    if name is not None:
+        state = f"after {snes.getIterationNumber()} iterations, with a residual of norm {snes.getFunctionNorm():.3e}"
+        return f"{name}, {nonlinear.MEANING.get(name, name)}, {state}. What may help: a smaller dt"
+    ts_reason: Any = ts.getConvergedReason()
+    if ts_reason == PETSc.TS.ConvergedReason.DIVERGED_STEP_REJECTED:
+        return "DIVERGED_STEP_REJECTED, its error was too large again and again: loosen ts_rtol and ts_atol"
+    return "values are not finite: see that coefficients and data are, or take a smaller dt"

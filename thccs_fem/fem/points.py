@@ -1,0 +1,42 @@
+"""Values at points as a matrix, which makes forces at points of its transpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem import element
+from thccs_fem.fem.space import FunctionSpace
+
+__all__ = ["point_values"]
+
+
+def point_values(
+    V: FunctionSpace, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
+) -> sp.csr_array:
+    """Return the values of all functions of a space at points.
+
+    With B this matrix and k components, ``B @ u.x.array.reshape(-1, k)`` are the values of a function u. A force F_i at
+    point i does the work F_i . v(x_i) on a test function v, so that forces F of shape (n, k) are the load
+    ``(B.T @ F).ravel()``.
+
+    Args:
+        V: The space; of one with vector values the scalar functions are meant.
+        faces: Faces of the control mesh, shape (n,).
+        uv: Coordinates in [0, 1]^2, shape (n, 2), as for `limit.evaluate`.
+        corner: Sub-quad of a polygon, shape (n,).
+
+    Returns:
+        Shape (n, V.num_functions); 16 entries a row in regular cells of level 0.
+
+    Raises:
+        TypeError: If faces or corners are no integers.
+        ValueError: If a face, coordinate or corner is out of range.
+    """
+    piece, position = V.cells.locate(faces, uv, corner)
+    splines = element.bspline_values(position)
+    local = (splines[:, 1, :, None] * splines[:, 0, None, :]).ravel()  # function i + 4 j is B_i(u) B_j(v)
+    number = np.arange(local.size + 1, dtype=np.int32)
+    at_points = sp.csr_array((local, number[:-1], number[::16]), shape=(piece.size, local.size))
+    return sp.csr_array(at_points @ V.cells.rows(piece))

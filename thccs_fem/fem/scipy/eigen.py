@@ -1,0 +1,94 @@
+"""Eigenvalue problems solved by ARPACK, through SciPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse.linalg as spla
+
+import ufl
+from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.eigen import EigenSystem, start_vector
+from thccs_fem.fem.forms import Form
+from thccs_fem.fem.function import Function
+from thccs_fem.fem.scipy.linear import factorised
+
+__all__ = ["EigenProblem"]
+
+Floats = npt.NDArray[np.float64]
+
+
+class EigenProblem:
+    """Find the numbers lambda and functions u with a(u, v) = lambda m(u, v) for all v, by Lanczos' method.
+
+    The eigenvalues are those nearest to a target, by shift and invert. Where the target is one of them, as zero on a
+    closed surface, the shift is moved a little below it.
+
+    Args:
+        a: Symmetric bilinear form.
+        m: Symmetric positive bilinear form; None: the inner product of L2.
+        bcs: Conditions, all with value zero. Their dofs are left out of the problem.
+        num_eigenvalues: How many are wanted.
+        target: Number that they are nearest to.
+        petsc_options_prefix: Ignored. It is here, as the next one, so that the import alone decides who solves.
+        petsc_options: Ignored.
+
+    Attributes:
+        bcs: The conditions; others may be put in their place before the next `solve`.
+
+    Raises:
+        TypeError: A form is no form, or a condition none.
+        ValueError: The forms are not bilinear forms on one space, a condition is in another one, or no eigenvalue is
+            wanted.
+    """
+
+    def __init__(
+        self,
+        a: ufl.Form | Form,
+        m: ufl.Form | Form | None = None,
+        *,
+        bcs: Sequence[DirichletBC] = (),
+        num_eigenvalues: int = 6,
+        target: float = 0.0,
+        petsc_options_prefix: str = "",
+        petsc_options: Mapping[str, Any] | None = None,
+    ):
+        self._system = EigenSystem(a, m, bcs=bcs, num_eigenvalues=num_eigenvalues, target=target)
+        self.bcs = bcs
+
+    def solve(self) -> tuple[Floats, list[Function]]:
+        """Assemble with the present values of coefficients, constants and conditions, and solve.
+
+        Returns:
+            Eigenvalues in ascending order, shape (num_eigenvalues,), and their functions, m-orthonormal. The first of
+            the largest coefficients of each is positive; of functions with one eigenvalue the choice is the solver's.
+
+        Raises:
+            ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
+                as many eigenvalues as wanted.
+            RuntimeError: Not all converge.
+        """
+        system = self._system
+        system.bcs = self.bcs
+        system.assemble()
+        shift, solved = self._inverse()
+        inverse = spla.LinearOperator(system.A.shape, matvec=solved, dtype=np.float64)
+        try:
+            values, vectors = spla.eigsh(
+                system.A, system.num_eigenvalues, system.M, sigma=shift, OPinv=inverse, v0=start_vector(system.M)
+            )
+        except spla.ArpackNoConvergence as error:
+            values, vectors = error.eigenvalues, error.eigenvectors
+        return system.accept(values, vectors, "ARPACK")
+
+    def _inverse(self) -> tuple[float, Callable[[Floats], Floats]]:
+        """Return a shift and what solves systems with the shifted matrix."""
+        system = self._system
+        try:
+            return system.target, factorised(system.shifted(system.target))
+        except RuntimeError:  # singular
+            shift = system.shift_beside()
+            return shift, factorised(system.shifted(shift))
