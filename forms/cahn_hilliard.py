@@ -9,8 +9,9 @@ functions with a continuous gradient, and no second unknown is needed. The integ
 `energy` falls by the integral of M |grad(mu)|^2 in a unit of time. Of waves with -div(grad(w)) = k^2 w on a mixture c
 the small ones grow like exp(s t) with s = -M k^2 (W''(c) + epsilon^2 k^2).
 
-Meant for closed surfaces. On a boundary the natural conditions are div(grad(u)) = 0 and no flux M grad(mu) . n: the
-contact condition grad(u) . n = 0 must be imposed, as by :func:`contact`.
+On a boundary the condition that nothing flows through, M grad(mu) . n = 0, is natural. The other one, grad(u) . n = 0
+where u meets a wall at a right angle, must be imposed: add :func:`contact` to F. Without it waves at the boundary grow
+faster the shorter they are.
 
 Source: Gomez, Calo, Bazilevs and Hughes, Isogeometric analysis of the Cahn-Hilliard phase-field model, Computer Methods
 in Applied Mechanics and Engineering 197 (2008), 4333-4352; here with the quartic W.

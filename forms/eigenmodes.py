@@ -8,7 +8,8 @@ Strong form, for eigenvalues lambda and modes u that are not zero, with n the ou
 
 The frequency is sqrt(lambda) / (2 pi). UFL's ``grad`` on a surface in space is the tangential one, so that the modes
 there are those of the Laplace-Beltrami operator; with nothing held the first mode is constant, lambda = 0. In weak
-form a(u, v) = lambda m(u, v) for all v: a generalised eigenvalue problem of two matrices.
+form a(u, v) = lambda m(u, v) for all v: a generalised eigenvalue problem of two matrices. For a plate take `plate.a`
+and `m` from here.
 
 Source: Strang and Fix, An analysis of the finite element method (1973), chapter 6.
 """

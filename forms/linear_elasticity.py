@@ -9,7 +9,7 @@ with the strain epsilon(u) = (grad(u) + grad(u)^T) / 2 and the stress
 
     sigma(u) = lmbda tr(epsilon(u)) I + 2 mu epsilon(u).
 
-The constants lmbda and mu are Lame's, by `plane_strain` for a body that is long across the plane and cannot widen
+The constants lmbda and mu are Lamé's, by `plane_strain` for a body that is long across the plane and cannot widen
 there, by `plane_stress` for a thin sheet that can.
 
 Source: Braess, Finite elements (3rd ed., 2007), chapter VI, sections 3 and 4.
@@ -20,7 +20,7 @@ from ufl.core.expr import Expr
 
 
 def plane_strain(E: float, nu: float) -> tuple[float, float]:
-    """Return Lame's constants lmbda and mu for zero strain across the plane.
+    """Return Lamé's constants lmbda and mu for zero strain across the plane.
 
     Args:
         E: Young's modulus.
@@ -30,7 +30,7 @@ def plane_strain(E: float, nu: float) -> tuple[float, float]:
 
 
 def plane_stress(E: float, nu: float) -> tuple[float, float]:
-    """Return Lame's constants lmbda and mu for zero stress across the plane.
+    """Return Lamé's constants lmbda and mu for zero stress across the plane.
 
     Args:
         E: Young's modulus.
@@ -53,7 +53,7 @@ def sigma(u: Expr, lmbda: Expr | float = 1, mu: Expr | float = 1) -> Expr:
 
     Args:
         u: Displacement.
-        lmbda: Lame's first constant.
+        lmbda: Lamé's first constant.
         mu: The second, the shear modulus.
     """
     return lmbda * ufl.tr(epsilon(u)) * ufl.Identity(2) + 2 * mu * epsilon(u)
@@ -65,7 +65,7 @@ def a(u: Expr, v: Expr, lmbda: Expr | float = 1, mu: Expr | float = 1) -> ufl.Fo
     Args:
         u: Trial function.
         v: Test function.
-        lmbda: Lame's first constant.
+        lmbda: Lamé's first constant.
         mu: The second, the shear modulus.
     """
     return ufl.inner(sigma(u, lmbda, mu), epsilon(v)) * ufl.dx
@@ -90,7 +90,7 @@ def strong_residual(u: Expr, f: Expr, lmbda: Expr | float = 1, mu: Expr | float 
     Args:
         u: Approximate displacement.
         f: Force per area.
-        lmbda: Lame's first constant.
+        lmbda: Lamé's first constant.
         mu: The second, the shear modulus.
     """
     return f + ufl.div(sigma(u, lmbda, mu))
