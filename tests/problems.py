@@ -1,20 +1,25 @@
 """Model problems, and ways to refine, for the tests of rates, errors and marking."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 import ufl
-from thccs_fem import adapt, estimate, fem
+from thccs_fem import adapt, estimate, fem, generators
 from thccs_fem.fem.scipy import LinearProblem
 from thccs_fem.mesh import ControlMesh
 from ufl import dx, grad, inner
 
 __all__ = [
     "errors",
+    "graded_l_domain",
     "lifted",
     "moved_inside",
     "poisson",
     "projected_in_h1",
     "randomly_refined",
+    "refined_anywhere",
+    "refined_towards",
     "singular",
     "smooth",
     "uniformly_refined",
@@ -55,6 +60,39 @@ def randomly_refined(V: fem.FunctionSpace, times: int = 3, seed: int = 0) -> fem
     for _ in range(times):
         weight = np.arange(1.0, V.num_functions + 1) ** 2
         V = adapt.refine(V, rng.choice(V.num_functions, size=3, replace=False, p=weight / weight.sum()))
+    return V
+
+
+def refined_towards(
+    V: fem.FunctionSpace, point: Sequence[float], num_levels: int, count: int = 24
+) -> fem.FunctionSpace:
+    """Refine the functions of the finest level that are next to a point, again and again."""
+    while V.num_levels < num_levels:
+        first = V.hierarchy.dof_offsets[-2]
+        distance = np.linalg.norm(V.reference_points[first:] - np.array(point), axis=1)
+        V = adapt.refine(V, first + np.argsort(distance, kind="stable")[:count])
+    return V
+
+
+def refined_anywhere(V: fem.FunctionSpace, num_levels: int, seed: int = 0) -> fem.FunctionSpace:
+    """Refine one in sixteen of the functions of the finest level, wherever they are."""
+    rng = np.random.default_rng(seed)
+    while V.num_levels < num_levels:
+        new = np.arange(V.hierarchy.dof_offsets[-2], V.num_functions)
+        V = adapt.refine(V, rng.choice(new, size=max(3, new.size // 16), replace=False))
+    return V
+
+
+def graded_l_domain(num_levels: int, theta: float = 0.5) -> fem.FunctionSpace:
+    """Return a space on the L-domain with its corner at the origin, refined as the H1 error of r^(2/3) asks for."""
+    V = fem.functionspace(generators.l_domain(4), ("THCCS", 3))
+    while V.num_levels < num_levels:
+        size = 0.25 * 0.5 ** np.repeat(np.arange(V.num_levels), np.diff(V.hierarchy.dof_offsets))
+        distance = np.maximum(np.linalg.norm(V.reference_points, axis=1), size)
+        error = size**4 * distance ** (2 / 3 - 4)
+        order = np.argsort(-error, kind="stable")
+        carried = np.cumsum(error[order] ** 2)
+        V = adapt.refine(V, order[: np.searchsorted(carried, theta * carried[-1]) + 1])
     return V
 
 

@@ -353,7 +353,7 @@ def test_transfer_to_an_unrelated_space_is_refused() -> None:
 
 @pytest.mark.parametrize("projection", ["L2", "H1"])
 def test_transfer_to_a_coarser_space_projects(projection: Literal["L2", "H1"]) -> None:
-    """What came from the coarser space comes back, and zero is zero; test_coarsening.py has the rest."""
+    """What came from the coarser space comes back, and zero is zero; test_remeshing.py has the rest."""
     V = space("refined cube")
     fine = randomly_refined(V, times=2, seed=1)
     u = with_random_values(V)

@@ -28,6 +28,11 @@ def test_files_that_a_page_names_are_there(page: Path) -> None:
     assert [name for name in names if not (ROOT / name).exists()] == []
 
 
+def test_readme_lists_every_demo() -> None:
+    readme = (ROOT / "README.md").read_text()
+    assert [path.name for path in (ROOT / "demos").glob("*.py") if f"`{path.name}`" not in readme] == []
+
+
 def test_every_form_is_listed_with_its_demo_and_test() -> None:
     page = (ROOT / "docs/forms.md").read_text()
     forms = [path.name for path in (ROOT / "forms").glob("*.py") if path.name != "__init__.py"]

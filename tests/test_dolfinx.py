@@ -13,6 +13,7 @@ import ufl
 from thccs_fem import adapt, fem, generators
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.scipy import LinearProblem
+from thccs_fem.hierarchy import Hierarchy
 from ufl import dx, grad, inner
 
 pytest.importorskip("mpi4py.MPI")
@@ -163,6 +164,14 @@ def test_cells_may_have_another_order_than_pieces(monkeypatch: pytest.MonkeyPatc
     assert np.sqrt(dolfinx.fem.assemble_scalar(error)) < 0.1  # 1.0 if pieces are mistaken for one another
 
 
+def test_cellwise_functions_are_constant_on_pieces(V: fem.FunctionSpace) -> None:
+    """With the sizes of the cells the integral of 1 / h^2 is the number of cells."""
+    h = bridge.function(fem.cell_sizes(V))
+    assert h.function_space.mesh is bridge.mesh(V)
+    count = dolfinx.fem.assemble_scalar(dolfinx.fem.form(1 / h**2 * dx(metadata={"quadrature_degree": 11})))
+    assert count == pytest.approx(V.num_cells, rel=1e-6)  # quadrature of areas that are no polynomials
+
+
 def test_one_mesh_for_the_same_pieces() -> None:
     V = fem.functionspace(generators.rectangle((2, 2)), ("THCCS", 3))
     assert bridge.mesh(V) is bridge.mesh(with_values(V, 2))
@@ -177,8 +186,7 @@ def test_what_is_no_space_is_refused() -> None:
         bridge.mesh(Q)
 
 
-def test_several_ranks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    V = fem.functionspace(generators.rectangle((2, 2)), ("THCCS", 3))
-    monkeypatch.setattr(bridge, "comm_of", lambda V: SimpleNamespace(size=3))
+def test_several_ranks_are_refused() -> None:
+    V = fem.FunctionSpace(Hierarchy.on(generators.rectangle((2, 2), comm=SimpleNamespace(size=3))))
     with pytest.raises(NotImplementedError, match="has 3 ranks, but the bridge to DOLFINx is serial"):
         bridge.mesh(V)

@@ -12,6 +12,7 @@ from problems import randomly_refined
 import ufl
 from thccs_fem import fem, generators
 from thccs_fem.fem import scipy as fem_scipy
+from thccs_fem.fem.eigen import EigenSystem
 from thccs_fem.fem.space import FunctionSpace
 from ufl import div, dx, grad, inner, sym
 
@@ -167,6 +168,18 @@ def test_functions_are_orthonormal_with_a_sign(make: Maker) -> None:
         assert x[largest] > 0.0
 
 
+def test_vectors_are_normalised_and_turned() -> None:
+    V = rectangle(4)
+    system = EigenSystem(laplace(V), bcs=fixed(V), num_eigenvalues=2)
+    system.assemble()
+    vectors = -7.0 * np.abs(np.random.default_rng(0).standard_normal((system.free.size, 3)))
+    values, functions = system.accept(np.array([5.0, 4.0, 1.0]), vectors, "nobody")
+    assert values.tolist() == [4.0, 5.0]  # ascending, and no more than are wanted
+    for function in functions:
+        assert fem.assemble_scalar(fem.form(function**2 * dx)) == pytest.approx(1.0, rel=1e-12)
+        assert (function.x.array[system.free] > 0.0).all()
+
+
 @BOTH
 def test_results_are_the_same_each_time(make: Maker) -> None:
     V = sphere()
@@ -254,10 +267,18 @@ def test_slepc_that_does_not_converge() -> None:
 
 def test_options_choose_the_solver() -> None:
     V = rectangle()
-    options = {"eps_type": "subspace", "eps_tol": 1e-9, "st_pc_type": "lu", "st_pc_factor_mat_solver_type": "petsc"}
-    problem = slepc_problem(laplace(V), bcs=fixed(V), num_eigenvalues=3, petsc_options=options)
+    options = {
+        "eps_type": "subspace",
+        "eps_tol": 1e-9,
+        "eps_nev": 3,
+        "eps_target": 1.0,
+        "st_pc_type": "lu",
+        "st_pc_factor_mat_solver_type": "petsc",
+    }
+    problem = slepc_problem(laplace(V), bcs=fixed(V), petsc_options=options)
     values, _ = problem.solve()
     assert problem.solver.getType() == "subspace"
+    assert problem.solver.getTarget() == problem.solver.getST().getShift() == 1.0
     assert problem.solver.getST().getKSP().getPC().getFactorSolverType() == "petsc"
     np.testing.assert_allclose(values, of_rectangle(1, 3), rtol=1e-4)
 

@@ -250,7 +250,7 @@ def test_residual_with_a_neumann_condition_is_as_large_as_the_error_on_all_level
         eta = estimate.residual(uh, f + div(grad(uh)) - uh, g - ufl.dot(grad(uh), n), grad(uh))
         effectivities.append(estimate.norm(V, eta) / errors(uh, exact)[1])
     assert 5.0 < min(effectivities)
-    assert max(effectivities) < 12.0
+    assert max(effectivities) < 10.0  # 6.5 to 6.7 on regular meshes, 5.7 to 8.0 at valence 5
 
 
 def test_functions_on_finer_cells_are_refused_on_edges() -> None:

@@ -23,6 +23,7 @@ from thccs_fem.fem.linear import (
     constrain,
     constraints,
     drops_constants,
+    is_fourth_order,
     is_symmetric,
     unfixed_constants,
 )
@@ -245,6 +246,20 @@ def test_forms_say_whether_they_drop_constants() -> None:
     ]
     for form, expected in cases:
         assert drops(form) == expected
+
+
+def test_forms_of_fourth_order_are_recognised() -> None:
+    V = torus((2,))
+    u, v = arguments(V)
+    w = fem.Function(V)
+    cases = [
+        (inner(div(grad(u)), div(grad(v))) * dx, True),
+        (inner(div(grad(u)), v) * dx, True),
+        (laplace(V), False),
+        (inner(div(grad(w)), u) * w[0] * v[0] * dx, False),
+    ]
+    for form, expected in cases:
+        assert is_fourth_order([[None], [fem.form(form)]]) is expected
 
 
 def test_each_component_has_its_constant() -> None:

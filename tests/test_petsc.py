@@ -263,10 +263,11 @@ def test_coefficients_may_be_finer(module: Any) -> None:
     # Integrals are then over finer cells than those of the unknown.
     V = torus()
     u, v, _ = arguments(V)
-    one = fem.Function(adapt.refine(V, [2, 9]))
-    one.x.array = 1.0
+    one = fem.Function(adapt.refine(V, [2, 9]))  # zero at first
     same = dx(metadata={"quadrature_degree": 9})  # on both sides, so that constants are exact
     problem = module.LinearProblem(one * u * v * same, 2.0 * one * v * same, petsc_options_prefix="finer_")
+    assert problem.A is not None  # assembled
+    one.x.array = 1.0
     np.testing.assert_allclose(problem.solve().x.array, 2.0, rtol=1e-9)
     one.x.array = 3.0
     np.testing.assert_allclose(problem.solve().x.array, 2.0, rtol=1e-9)
@@ -349,6 +350,15 @@ def test_large_systems_are_iterated(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(problem.solve().x.array, 2.0, rtol=1e-8)
         assert (problem.solver.getType(), problem.solver.getPC().getType()) == (kind, "gamg")
         assert problem.solver.getTolerances()[0] == 1e-10
+
+
+def test_equations_of_fourth_order_are_factorised_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(petsc.linear, "LARGEST_DIRECT", 10)
+    V = torus()
+    u, v, _ = arguments(V)
+    problem = LinearProblem((div(grad(u)) * div(grad(v)) + u * v) * dx, 2.0 * v * dx, petsc_options_prefix="fourth_")
+    np.testing.assert_allclose(problem.solve().x.array, 2.0, rtol=1e-8)
+    assert problem.solver.getPC().getType() == "cholesky"
 
 
 def test_solvers_may_be_chosen_in_code() -> None:

@@ -43,8 +43,8 @@ import basix.ufl
 from thccs_fem import element
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.petsc.matrices import comm_of, new_mat
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.petsc.matrices import new_mat
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.subdivision import Ints
 
 __all__ = ["extraction_matrix", "function", "functionspace", "mesh"]
@@ -55,19 +55,19 @@ Floats = npt.NDArray[np.float64]
 _meshes: WeakKeyDictionary[Cells, dolfinx.mesh.Mesh[np.float64]] = WeakKeyDictionary()
 
 
-def mesh(V: FunctionSpace) -> dolfinx.mesh.Mesh[np.float64]:
+def mesh(V: FunctionSpace | CellwiseSpace) -> dolfinx.mesh.Mesh[np.float64]:
     """Return the pieces of a space as a mesh of DOLFINx, of degree 3; the same one for the same pieces.
 
     Args:
-        V: The space; those of other value shapes on its hierarchy have the same pieces.
+        V: The space; those of other value shapes on its hierarchy, and what is cellwise on it, have the same pieces.
 
     Raises:
         TypeError: V is no space of ours.
         NotImplementedError: The mesh is distributed over several ranks.
     """
-    if not isinstance(V, FunctionSpace):
+    if not isinstance(V, FunctionSpace | CellwiseSpace):
         raise TypeError(f"a space from thccs_fem.fem.functionspace is needed, got {type(V).__name__}")
-    comm = comm_of(V)
+    comm = MPI.COMM_SELF if V.mesh.comm is None else V.mesh.comm
     if comm.size > 1:
         raise NotImplementedError(
             f"the communicator has {comm.size} ranks, but the bridge to DOLFINx is serial so far: run on one rank, or "
@@ -91,7 +91,7 @@ def _mesh(cells: Cells, comm: MPI.Comm) -> dolfinx.mesh.Mesh[np.float64]:
     )
 
 
-def functionspace(V: FunctionSpace) -> dolfinx.fem.FunctionSpace[np.float64]:
+def functionspace(V: FunctionSpace | CellwiseSpace) -> dolfinx.fem.FunctionSpace[np.float64]:
     """Return the discontinuous space of degree 3 on `mesh(V)`, with values of the shape of V's: V is part of it.
 
     Raises:
@@ -104,12 +104,12 @@ def function(uh: Function) -> dolfinx.fem.Function[np.float64]:
     """Return a function of ours as one of DOLFINx, in `functionspace`: the same at all points.
 
     Args:
-        uh: The function; its values are copied.
+        uh: The function, which may be a cellwise one, as `fem.cell_sizes`; its values are copied.
 
     Raises:
         TypeError, NotImplementedError: As for `mesh`.
     """
-    V = uh.function_space
+    V = uh.space
     Q = functionspace(V)
     result: dolfinx.fem.Function[np.float64] = dolfinx.fem.Function(Q, name=uh.name, dtype=np.float64)
     values = _at_nodes(Q) @ uh.local_coefficients()[_piece(Q)]

@@ -4,12 +4,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import scipy.linalg
 from problems import errors, lifted, moved_inside, randomly_refined, uniformly_refined, wavy
 
 import ufl
 from thccs_fem import fem, generators
 from thccs_fem.fem.scipy import EigenProblem, LinearProblem, NonlinearProblem
-from thccs_fem.forms import eigenmodes, helmholtz, laplace_beltrami, linear_elasticity, minimal_surface, poisson
+from thccs_fem.forms import eigenmodes, helmholtz, laplace_beltrami, linear_elasticity, minimal_surface, plate, poisson
 from thccs_fem.mesh import ControlMesh
 from ufl import as_vector, cos, dot, grad, sin
 
@@ -91,6 +92,23 @@ def test_nitsche_on_a_surface_tends_to_the_strong_solution() -> None:
     rates = -np.polyfit(np.arange(3), np.log2(found[-3:]), 1)[0]
     assert (np.abs(rates - FULL - 0.2) < 2 * TOLERANCE).all()
     assert (np.array(found[-1]) < 1.1 * np.array((6.7e-9, 8.5e-7))).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("msh", "first"),
+    # pi^2 (1 + 1), and the square of the first zero of the Bessel function J_0.
+    [(generators.rectangle((4, 4)), 2 * np.pi**2), (generators.disc(2), 2.404825557695773**2)],
+    ids=["square", "disc"],
+)
+def test_nitsche_is_positive_with_the_default_penalty(msh: ControlMesh, first: float, seed: int) -> None:
+    """The first eigenvalue is that of the strong condition; with too small a penalty it is large and negative."""
+    V = randomly_refined(fem.functionspace(moved_inside(msh, 0.15, seed), ("THCCS", 3)), times=2, seed=seed)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    weak = poisson.a(u, v) + poisson.nitsche(u, v, 0, fem.cell_sizes(V))
+    matrix, mass = (fem.assemble_matrix(fem.form(a)).toarray() for a in (weak, u * v * ufl.dx))
+    np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.abs(matrix).max())
+    assert scipy.linalg.eigvalsh(matrix, mass)[0] == pytest.approx(first, rel=2e-3)  # the rim is no exact circle
 
 
 # ---- Helmholtz
@@ -306,3 +324,13 @@ def test_tones_of_a_heavy_membrane() -> None:
     assert eigenvalue == pytest.approx(3 / 2 * (np.pi / 2) ** 2, rel=1e-8)
     residual = eigenmodes.strong_residual(mode, eigenvalue, kappa=3, rho=2)
     assert fem.assemble_scalar(fem.form(residual**2 * ufl.dx)) < 1e-4
+
+
+def test_tones_of_a_supported_plate() -> None:
+    """The squares of those of the drum of the same shape: supported edges that are straight do not feel nu."""
+    V = fem.functionspace(generators.rectangle((8, 8)), ("THCCS", 3))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    held = [fem.dirichletbc(0.0, fem.boundary_dofs(V), V)]
+    eigenvalues, _ = EigenProblem(plate.a(u, v), eigenmodes.m(u, v), bcs=held, num_eigenvalues=3).solve()
+    exact = (np.pi**2 * np.array([2.0, 5.0, 5.0])) ** 2
+    np.testing.assert_allclose(eigenvalues, exact, rtol=5e-4)  # fourth order, on 8 cells

@@ -1,7 +1,7 @@
 """Function spaces, functions, forms, assembly and boundary conditions.
 
-Linear problems are solved by `thccs_fem.fem.scipy`, or by `thccs_fem.fem.petsc`, which must be imported explicitly: it
-needs petsc4py and mpi4py.
+Linear, nonlinear and eigenvalue problems are solved by `thccs_fem.fem.scipy`, or by `thccs_fem.fem.petsc`, which must
+be imported explicitly: it needs petsc4py and mpi4py.
 """
 
 from thccs_fem.fem.assembly import assemble_cells, assemble_matrix, assemble_scalar, assemble_vector

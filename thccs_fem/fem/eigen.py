@@ -125,7 +125,7 @@ class EigenSystem:
         """Return eigenvalues in ascending order, and their functions with m-norm 1 and a sign of our choice.
 
         Args:
-            eigenvalues: Those that converged, shape (k,).
+            eigenvalues: Those that converged, those wanted first, shape (k,).
             vectors: Eigenvectors, shape (n, k).
             solver: Who found them, for messages.
 
@@ -137,8 +137,7 @@ class EigenSystem:
                 f"{solver} found {eigenvalues.size} of {self.num_eigenvalues} eigenvalues near {self.target:g}. What "
                 f"may help: more iterations, a larger subspace (eps_ncv), or a target nearer to what is wanted"
             )
-        nearest = np.argsort(np.abs(eigenvalues - self.target), kind="stable")[: self.num_eigenvalues]
-        order = nearest[np.argsort(eigenvalues[nearest], kind="stable")]
+        order = np.argsort(eigenvalues[: self.num_eigenvalues], kind="stable")
         return eigenvalues[order], [self._function(vectors[:, i]) for i in order]
 
     def _function(self, vector: Floats) -> Function:

@@ -76,6 +76,7 @@ class EigenProblem:
         self._solver.setOptionsPrefix(petsc_options_prefix)
         self._solver.setProblemType(SLEPc.EPS.ProblemType.GHEP)
         self._solver.setDimensions(num_eigenvalues)
+        self._solver.setTarget(target)
         self._solver.setTolerances(tol=TOLERANCE)
         self._solver.setWhichEigenpairs(SLEPc.EPS.Which.TARGET_MAGNITUDE)
         transform = self._solver.getST()
@@ -87,6 +88,8 @@ class EigenProblem:
             pc.setFactorSolverType("mumps")
         with self._options.in_place():
             self._solver.setFromOptions()
+        self._system.num_eigenvalues, _, _ = self._solver.getDimensions()
+        self._system.target = self._solver.getTarget()
 
     @property
     def solver(self) -> SLEPc.EPS:
@@ -112,7 +115,6 @@ class EigenProblem:
         with self._options.in_place():
             solver.setOperators(A, M)
             solver.setInitialSpace([new_vec(start_vector(system.M), self._comm)])
-            solver.setTarget(system.target)
             solver.getST().setShift(self._shift())
             solver.solve()
         self._options.warn_unused()
@@ -137,7 +139,7 @@ class EigenProblem:
         try:
             trial.setUp()
             check_regular(shifted, lambda r: solved(trial.getFactorMatrix(), r))
-        except (RuntimeError, PETSc.Error):  # PETSc's own is one that factors are missing
+        except RuntimeError:  # ours, or PETSc's own, if there are no factors
             return system.shift_beside()
         return system.target
 

@@ -16,7 +16,7 @@ from thccs_fem.fem import nonlinear
 from thccs_fem.fem.blocks import Conditions
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.linear import is_fourth_order
+from thccs_fem.fem.linear import check_regular, is_fourth_order
 from thccs_fem.fem.nonlinear import MAX_ITERATIONS, RELATIVE, STEP, NonlinearSystem
 from thccs_fem.fem.petsc import linear
 from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec
@@ -182,6 +182,8 @@ class NonlinearProblem:
         if name == "DIVERGED_LINEAR_SOLVE":
             ksp_reason: Any = solver.getKSP().getConvergedReason()
             why = f"{linear.failure(solver.getKSP())}. {linear.help_for(ksp_reason)}"
+        if linear.factorises(solver.getKSP().getPC()):
+            why += self._singular()
         first = self.norms[0] if self.norms else np.nan
         raise RuntimeError(
             nonlinear.failure(
@@ -192,6 +194,17 @@ class NonlinearProblem:
                 first,
             )
         )
+
+    def _singular(self) -> str:
+        """Return what to say if the last Jacobian that was factorised is singular, which MUMPS seldom notices."""
+        factors = self._solver.getKSP().getPC()
+        try:
+            check_regular(self._system.regular(), lambda r: linear.solved(factors.getFactorMatrix(), r))
+        except PETSc.Error:  # there are no factors
+            return ""
+        except RuntimeError as error:
+            return f" ({error})"
+        return ""
 
 
 # Functions, not methods: a SNES that knew its problem would never be freed.

@@ -152,7 +152,6 @@ class TimeProblem:
             ts.restartStep()
         if self._before is None:
             x.array = self._equations.with_prescribed(self.u.x.array, self.time)
-        self._equations.forget()
         number, dt, before = self.step_number, self.dt, (self.time, _values(x).copy())
         try:
             with self._options.in_place():
@@ -163,6 +162,7 @@ class TimeProblem:
                 raise RuntimeError(f"PETSc's {ts.getType()} failed {where}: {_why(ts)}")
         except Exception as error:
             self._equations.accept(*before)
+            self._equations.forget()
             self._ts = self._stepper(before[0], number, dt)
             if isinstance(error, PETSc.Error) and error.__cause__ is not None:  # what bcs raised
                 raise error.__cause__ from None
@@ -203,7 +203,8 @@ class TimeProblem:
         """Return the problem that goes on from here in another space; this one stays as it is.
 
         In F, u, udot and the test function are replaced by those of V. The state before the last step is carried over
-        like u, so that BDF2 goes on as if nothing had happened, and keeps its order.
+        like u, so that BDF2 goes on as if nothing had happened, and keeps its order. All other functions in F, such as
+        data, stay where they are.
 
         Args:
             V: The space, with values of the same shape.
@@ -362,7 +363,7 @@ class _Equations:
             changed(self.A)
 
     def forget(self) -> None:
-        """Have conditions found anew: who prescribes them may have changed his mind."""
+        """Have conditions found anew, also at a time for which they were found before."""
         self._prescribed = None
 
     def _set(self, t: float, u: PETSc.Vec, udot: PETSc.Vec) -> None:
