@@ -1,41 +1,21 @@
-"""Dirichlet conditions: which functions, and which values."""
-
-import functools
-import warnings
+"""Dirichlet conditions: which functions, and which values; for values that are expressions see test_fitting.py."""
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from refinements import bernstein_rows, geometry_dofs, random_positions
+from refinements import bernstein_rows
+from rim import WITH_RIM, slopes_on_the_rim, space, unit_square, with_random_values
 from zoo import ZOO
 
 import ufl
 from thccs_fem import adapt, fem, generators, limit
-from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.mesh import ControlMesh
-from ufl import as_vector, sin, sqrt
 
 Floats = npt.NDArray[np.float64]
 
 SCALAR = ("THCCS", 3)
-WITH_RIM = [name for name, make in ZOO.items() if make().boundary_edges.size]
 SIDES = [[0, 1, 2, 3], [3, 7, 11, 15], [15, 14, 13, 12], [12, 8, 4, 0]]
-
-
-@functools.cache
-def space(name: str, boundary: str = "clamped", times: int = 0) -> FunctionSpace:
-    V = fem.functionspace(ZOO[name](), SCALAR, boundary=boundary)
-    for _ in range(times):
-        V = adapt.refine(V, [0, V.num_functions - 1, V.num_functions // 2])
-    return V
-
-
-def with_random_values(V: FunctionSpace, dofs: npt.ArrayLike) -> fem.Function:
-    """Return a function whose coefficients are random at the given dofs, and else zero."""
-    u = fem.Function(V)
-    u.x.array[dofs] = np.random.default_rng(0).uniform(1.0, 2.0, np.size(dofs))
-    return u
 
 
 def others(V: FunctionSpace, functions: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
@@ -47,14 +27,6 @@ def on_the_rim(V: FunctionSpace) -> Floats:
     piece, side, _ = V.cells.boundary_pieces
     rows = bernstein_rows(V.cells)
     return rows[(16 * piece[:, None] + np.array(SIDES)[side]).ravel()].toarray()
-
-
-def unit_square(n: int = 4, times: int = 0, shape: tuple[int, ...] = ()) -> FunctionSpace:
-    msh = generators.rectangle((n, n), lower=(0.0, 0.0), upper=(1.0, 1.0))
-    V = fem.functionspace(msh, ("THCCS", 3, shape))
-    for _ in range(times):
-        V = adapt.refine(V, [0, V.num_functions - 1, V.num_functions // 2])
-    return V
 
 
 # ---- locate_dofs_geometrical
@@ -160,6 +132,36 @@ def test_tagged_edges_of_polygons() -> None:
 def test_a_marker_and_a_tag_are_refused() -> None:
     with pytest.raises(ValueError, match="give a marker or a tag, not both"):
         fem.boundary_dofs(unit_square(), lambda x: x[0] < 1, tag=3)
+
+
+# ---- boundary_dofs with slope
+
+
+@pytest.mark.parametrize("times", [0, 2])
+@pytest.mark.parametrize("boundary", ["clamped", "crease"])
+@pytest.mark.parametrize("name", WITH_RIM)
+def test_all_other_functions_have_no_value_and_no_slope(name: str, boundary: str, times: int) -> None:
+    V = space(name, boundary, times)
+    found = fem.boundary_dofs(V, slope=True)
+    assert set(fem.boundary_dofs(V)) <= set(found)
+    value, slope = slopes_on_the_rim(with_random_values(V, others(V, found)))
+    np.testing.assert_allclose(value, 0.0, atol=1e-12)
+    np.testing.assert_allclose(slope, 0.0, atol=1e-11)  # differences of values of size 2, over cells of size 0.1
+
+
+@pytest.mark.parametrize("times", [0, 2])
+def test_each_of_these_functions_has_a_value_or_a_slope(times: int) -> None:
+    for name in ("grid", "wheel6", "l_domain_tagged", "rim_of_four"):
+        V = space(name, times=times)
+        for dof in fem.boundary_dofs(V, slope=True):
+            value, slope = slopes_on_the_rim(with_random_values(V, [dof]))
+            assert max(np.abs(value).max(), np.abs(slope).max()) > 1e-4, dof
+
+
+def test_numbers_of_slope_dofs_are_those_of_splines() -> None:
+    V = unit_square()
+    assert fem.boundary_dofs(V, slope=True).size == 4 * 6 + 4 * 4  # the two outermost rings of 7 x 7
+    assert fem.boundary_dofs(V, lambda x: np.isclose(x[1], 0.0), slope=True).size == 2 * 7
 
 
 # ---- region_dofs
@@ -280,266 +282,3 @@ def test_conditions_are_on_spaces() -> None:
         TypeError, match=r"dirichletbc needs a space from fem\.functionspace, or V\.sub\(c\), got Function"
     ):
         fem.dirichletbc(0.0, [4, 5], fem.Function(unit_square()))  # type: ignore[arg-type]
-
-
-# ---- Expressions
-
-# The position is in the space, so that its projection must find its coefficients, on any part of the surface, whatever
-# the refinement. Tolerance: functions that hardly reach into the part are determined by what has a weight of 1e-6.
-TOLERANCE = 1e-8
-
-
-@pytest.mark.parametrize("times", [0, 2])
-@pytest.mark.parametrize("boundary", ["clamped", "crease"])
-@pytest.mark.parametrize("name", WITH_RIM)
-def test_the_position_on_the_boundary(name: str, boundary: str, times: int) -> None:
-    V = space(name, boundary, times)
-    dofs = fem.boundary_dofs(V)
-    x = ufl.SpatialCoordinate(V.mesh)
-    expected = geometry_dofs(V.hierarchy)[dofs]
-    np.testing.assert_allclose(fem.dirichletbc(x[1], dofs, V).values, expected[:, 1], atol=TOLERANCE)
-    np.testing.assert_allclose(fem.dirichletbc(lambda x: x[0], dofs, V).values, expected[:, 0], atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("times", [0, 2])
-@pytest.mark.parametrize("boundary", ["clamped", "crease"])
-@pytest.mark.parametrize("name", ZOO)
-def test_the_position_on_one_face(name: str, boundary: str, times: int) -> None:
-    V = space(name, boundary, times)
-    dofs = fem.region_dofs(V, [0])
-    values = fem.dirichletbc(ufl.SpatialCoordinate(V.mesh)[0], dofs, V).values
-    np.testing.assert_allclose(values, geometry_dofs(V.hierarchy)[dofs, 0], atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("times", [0, 2])
-def test_the_position_at_single_functions(times: int) -> None:
-    V = space("wheel5", times=times)
-    x = ufl.SpatialCoordinate(V.mesh)
-    expected = geometry_dofs(V.hierarchy)
-    for dof in range(0, V.num_functions, 7):
-        np.testing.assert_allclose(fem.dirichletbc(x[2], [dof], V).values, expected[[dof], 2], atol=TOLERANCE)
-
-
-def test_parts_of_the_boundary_are_fitted_for_themselves() -> None:
-    # Zero on the left side, but not zero, or not even defined, beside it.
-    V = unit_square(times=1)
-    left = fem.boundary_dofs(V, lambda x: np.isclose(x[0], 0.0))
-    x = ufl.SpatialCoordinate(V.mesh)
-    jump = fem.dirichletbc(ufl.conditional(ufl.gt(x[0], 1e-9), 1e3, 0.0), left, V)
-    np.testing.assert_allclose(jump.values, 0.0, atol=0.1)  # 1e3 with the weight 1e-6
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        undefined = fem.dirichletbc(lambda x: np.where(x[0] > 1e-9, np.nan, 0.0), left, V)
-    np.testing.assert_allclose(undefined.values, 0.0, atol=1e-12)
-
-
-def test_values_of_a_region_are_those_of_the_expression() -> None:
-    # Smooth, but not in the space: the projection comes near it in the region at full order.
-    errors = []
-    for n in (8, 16):
-        msh = generators.torus((2 * n, n))
-        V = fem.functionspace(msh, SCALAR)
-        x = ufl.SpatialCoordinate(msh)
-        faces = np.flatnonzero(msh.vertices[msh.quads].mean(axis=1)[:, 0] > 1.5)
-        u = fem.Function(V)
-        bc = fem.dirichletbc(sin(x[0] + 2 * x[1]), fem.region_dofs(V, faces), V)
-        u.x.array[bc.dofs] = bc.values
-        uv = np.random.default_rng(0).random((faces.size, 2))
-        X = limit.evaluate(msh, faces, uv)[0]
-        errors.append(np.abs(u.eval(faces, uv) - np.sin(X[:, 0] + 2 * X[:, 1])).max())
-    assert errors[1] < 0.02
-    assert 3.0 < np.log2(errors[0] / errors[1]) < 5.5  # fourth order, of the maximum over random points
-
-
-def test_expressions_with_functions() -> None:
-    V = space("wheel5", times=1)
-    u = with_random_values(V, np.arange(V.num_functions))
-    c = fem.Constant(V.mesh, 2.0)
-    dofs = fem.boundary_dofs(V)
-    np.testing.assert_allclose(fem.dirichletbc(c * u, dofs, V).values, 2.0 * u.x.array[dofs], atol=TOLERANCE)
-    np.testing.assert_allclose(fem.dirichletbc(u, dofs, V).values, u.x.array[dofs], atol=TOLERANCE)
-
-
-def test_expressions_with_components() -> None:
-    scalar = space("wheel5")
-    V = FunctionSpace(scalar.hierarchy, (2,))
-    x = ufl.SpatialCoordinate(V.mesh)
-    dofs = fem.boundary_dofs(V)
-    first, second = (fem.dirichletbc(x[i], dofs, scalar).values for i in range(2))
-    both = fem.dirichletbc(as_vector([x[0], x[1]]), dofs, V)
-    np.testing.assert_allclose(both.values.reshape(-1, 2), np.stack([first, second], axis=1), atol=1e-12)
-    one = fem.dirichletbc(lambda x: x[1], dofs, V.sub(1))
-    np.testing.assert_array_equal(one.dofs, 2 * dofs + 1)
-    np.testing.assert_allclose(one.values, second, atol=1e-12)
-
-
-def test_expressions_of_another_shape_are_refused() -> None:
-    V = unit_square()
-    with pytest.raises(ValueError, match=r"the expression has shape \(2,\); 1 components are needed"):
-        fem.dirichletbc(ufl.SpatialCoordinate(V.mesh), fem.boundary_dofs(V), V)
-
-
-def test_expressions_are_finite_where_they_are_prescribed() -> None:
-    V = unit_square()
-    x = ufl.SpatialCoordinate(V.mesh)
-    with pytest.raises(ValueError, match="the value is not finite on 8 of the 16 edges"):
-        fem.dirichletbc(sqrt(x[1] - 0.5), fem.boundary_dofs(V), V)
-
-
-def test_conditions_hold_at_points_of_the_rim() -> None:
-    V = space("wheel6", times=2)
-    x = ufl.SpatialCoordinate(V.mesh)
-    u, dofs = fem.Function(V), fem.boundary_dofs(V)
-    u.x.array = np.random.default_rng(0).random(V.num_functions)
-    bc = fem.dirichletbc(x[0] - x[2], dofs, V)
-    u.x.array[bc.dofs] = bc.values
-    edges = np.flatnonzero(V.mesh.edge_faces[:, 1] < 0)
-    faces, uv = [], []
-    for edge in edges:
-        face = V.mesh.edge_faces[edge, 0]
-        k = next(k for k in range(4) if set(np.roll(V.mesh.quads[face], -k)[:2]) == set(V.mesh.edges[edge]))
-        faces.append(face)
-        uv.append([[0.3, 0.0], [1.0, 0.3], [0.7, 1.0], [0.0, 0.7]][k])
-    X = limit.evaluate(V.mesh, faces, uv)[0]
-    np.testing.assert_allclose(u.eval(faces, uv), X[:, 0] - X[:, 2], atol=1e-9)
-
-
-# ---- Slopes
-
-
-def slopes_on_the_rim(u: fem.Function) -> tuple[Floats, Floats]:
-    """Values, and derivatives along the inner conormal, at points of all boundary edges, by differences of values."""
-    V = u.function_space
-    piece, side, _ = V.cells.boundary_pieces
-    corner = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])[side]
-    along = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])[side]
-    inward = np.array([[0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [1.0, 0.0]])[side]
-    at = corner + 0.3 * along
-
-    def derivative(local: Floats, direction: Floats) -> Floats:
-        values = [evaluate_pieces(local, piece, at + step * direction) for step in (0.0, 0.25, 0.5, 0.75)]
-        return (-11 * values[0] + 18 * values[1] - 9 * values[2] + 2 * values[3]) / 1.5  # exact for cubics
-
-    (xs, us), (xt, ut) = (
-        [derivative(local, direction) for local in (V.cells.piece_points, u.local_coefficients())]
-        for direction in (along, inward)
-    )
-    shear = (xt * xs).sum(axis=1) / (xs**2).sum(axis=1)
-    width = np.linalg.norm(xt - shear[:, None] * xs, axis=1)
-    return evaluate_pieces(u.local_coefficients(), piece, at)[:, 0], (ut[:, 0] - shear * us[:, 0]) / width
-
-
-@pytest.mark.parametrize("times", [0, 2])
-@pytest.mark.parametrize("boundary", ["clamped", "crease"])
-@pytest.mark.parametrize("name", WITH_RIM)
-def test_all_other_functions_have_no_value_and_no_slope(name: str, boundary: str, times: int) -> None:
-    V = space(name, boundary, times)
-    found = fem.boundary_dofs(V, slope=True)
-    assert set(fem.boundary_dofs(V)) <= set(found)
-    value, slope = slopes_on_the_rim(with_random_values(V, others(V, found)))
-    np.testing.assert_allclose(value, 0.0, atol=1e-12)
-    np.testing.assert_allclose(slope, 0.0, atol=1e-11)  # differences of values of size 2, over cells of size 0.1
-
-
-@pytest.mark.parametrize("times", [0, 2])
-def test_each_of_these_functions_has_a_value_or_a_slope(times: int) -> None:
-    for name in ("grid", "wheel6", "l_domain_tagged", "rim_of_four"):
-        V = space(name, times=times)
-        for dof in fem.boundary_dofs(V, slope=True):
-            value, slope = slopes_on_the_rim(with_random_values(V, [dof]))
-            assert max(np.abs(value).max(), np.abs(slope).max()) > 1e-4, dof
-
-
-def test_numbers_of_slope_dofs_are_those_of_splines() -> None:
-    V = unit_square()
-    assert fem.boundary_dofs(V, slope=True).size == 4 * 6 + 4 * 4  # the two outermost rings of 7 x 7
-    assert fem.boundary_dofs(V, lambda x: np.isclose(x[1], 0.0), slope=True).size == 2 * 7
-
-
-@pytest.mark.parametrize("times", [0, 2])
-@pytest.mark.parametrize("boundary", ["clamped", "crease"])
-@pytest.mark.parametrize("name", [name for name in WITH_RIM if name != "pole"])  # the slowest
-def test_value_and_slope_determine_what_is_in_the_space(name: str, boundary: str, times: int) -> None:
-    # Random coefficients: nothing is smooth here that could help.
-    V = space(name, boundary, times)
-    u = with_random_values(V, np.arange(V.num_functions))
-    dofs = fem.boundary_dofs(V, slope=True)
-    bc = fem.dirichletbc(u, dofs, V, slope=True)
-    np.testing.assert_array_equal(bc.dofs, dofs)
-    np.testing.assert_allclose(bc.values, u.x.array[dofs], atol=TOLERANCE)
-
-
-@pytest.mark.parametrize("times", [0, 2])
-def test_slopes_on_a_part_of_the_boundary(times: int) -> None:
-    V = unit_square(times=times)
-    dofs = fem.boundary_dofs(V, lambda x: np.isclose(x[0], 0.0), slope=True)
-    x = ufl.SpatialCoordinate(V.mesh)
-    u = fem.Function(V)
-    u.x.array[dofs] = fem.dirichletbc(1.0 + 2.0 * x[0], dofs, V, slope=True).values
-    value, slope = slopes_on_the_rim(u)
-    on_left = slopes_on_the_rim(fem.project(x[0], V))[0] < 1e-9
-    assert np.count_nonzero(on_left) >= 4
-    np.testing.assert_allclose(value[on_left], 1.0, atol=TOLERANCE)
-    np.testing.assert_allclose(slope[on_left], 2.0, atol=10 * TOLERANCE)  # cells of width 1/16 at least
-
-
-def test_values_and_slopes_are_fitted_at_full_order() -> None:
-    errors = []
-    for n in (4, 8):
-        msh = generators.disc(n)
-        V = fem.functionspace(msh, SCALAR)
-        x = ufl.SpatialCoordinate(msh)
-        u, dofs = fem.Function(V), fem.boundary_dofs(V, slope=True)
-        exact = sin(2 * x[0] + 1) * ufl.cos(1.5 * x[1])
-        u.x.array[dofs] = fem.dirichletbc(exact, dofs, V, slope=True).values
-        value, slope = slopes_on_the_rim(u)
-        # The exact ones, from the position and the conormal: both are values of functions of the space.
-        X, N = np.transpose([slopes_on_the_rim(fem.project(x[i], V)) for i in range(2)], (1, 2, 0))
-        a, b = 2 * X[:, 0] + 1, 1.5 * X[:, 1]
-        gradient = np.stack([2 * np.cos(a) * np.cos(b), -1.5 * np.sin(a) * np.sin(b)], axis=1)
-        errors.append([np.abs(value - np.sin(a) * np.cos(b)).max(), np.abs(slope - (gradient * N).sum(axis=1)).max()])
-    rates = np.log2(np.divide(*errors))
-    assert ((3.0 < rates) & (rates < 6.0)).all(), rates  # 4 for values; for slopes 3, or 4 where they superconverge
-    assert (np.array(errors[1]) < [1e-4, 1e-3]).all(), errors
-
-
-def test_zero_value_and_slope_are_zero_coefficients() -> None:
-    # (1 - x^2)^2 (1 - y^2)^2 and both its derivatives vanish on the rim; inside it is not small, nor in the space.
-    V = fem.functionspace(generators.rectangle((5, 5)), SCALAR)
-    x = ufl.SpatialCoordinate(V.mesh)
-    lower, upper = V.mesh.vertices.min(axis=0), V.mesh.vertices.max(axis=0)
-    bump = np.prod([16 * ((x[i] - lower[i]) * (upper[i] - x[i])) ** 2 / (upper[i] - lower[i]) ** 4 for i in (0, 1)])
-    dofs = fem.boundary_dofs(V, slope=True)
-    np.testing.assert_allclose(fem.dirichletbc(bump, dofs, V, slope=True).values, 0.0, atol=TOLERANCE)
-    assert np.abs(fem.dirichletbc(bump, dofs, V).values).max() > 1e-4  # fitted on the cells, it is merely near
-
-
-def test_slopes_of_vectors() -> None:
-    scalar = space("wheel5")
-    V = FunctionSpace(scalar.hierarchy, (2,))
-    x = ufl.SpatialCoordinate(V.mesh)
-    dofs = fem.boundary_dofs(V, slope=True)
-    both = fem.dirichletbc(as_vector([sin(x[0]), x[1] * x[2]]), dofs, V, slope=True).values.reshape(-1, 2)
-    for c, g in enumerate((sin(x[0]), x[1] * x[2])):
-        np.testing.assert_allclose(fem.dirichletbc(g, dofs, scalar, slope=True).values, both[:, c], atol=1e-10)
-    one = fem.dirichletbc(x[1] * x[2], dofs, V.sub(1), slope=True)
-    np.testing.assert_array_equal(one.dofs, 2 * dofs + 1)
-    np.testing.assert_allclose(one.values, both[:, 1], atol=1e-10)
-
-
-def test_slopes_that_cannot_be_had_are_refused() -> None:
-    V = unit_square()
-    dofs = fem.boundary_dofs(V, slope=True)
-    with pytest.raises(TypeError, match="slope=True needs a UFL expression, whose gradient is known, got function"):
-        fem.dirichletbc(lambda x: x[0], dofs, V, slope=True)
-    x = ufl.SpatialCoordinate(V.mesh)
-    with pytest.raises(ValueError, match="9 of the 49 dofs have neither value nor slope on the boundary, the first is"):
-        fem.dirichletbc(x[0], np.arange(49), V, slope=True)
-    with pytest.raises(ValueError, match="the value is not finite on 8 of the 16 edges"):
-        fem.dirichletbc(sqrt(x[1] - 0.5), dofs, V, slope=True)
-
-
-def test_positions_cover_the_surface() -> None:
-    # What the tests above rely on: random positions reach every face.
-    V = space("wheel5")
-    assert set(random_positions(V.hierarchy, 400)[0]) == set(range(V.mesh.num_faces))

@@ -244,7 +244,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "unknown tag of edges": (lambda: v * ds(3), ValueError, "ds(3), but tags are from 0, and those of edges on its"),
     "cellwise argument": (
-        lambda: ufl.TestFunction(constant.space) * dx,
+        lambda: ufl.TestFunction(constant.function_space) * dx,
         ValueError,
         "v_0 is constant on each cell, but test and trial .* integrals over each cell come from fem.assemble_cells",
     ),

@@ -135,7 +135,7 @@ def test_cellwise_values_are_those_of_the_face_or_cell(name: str) -> None:
     piece, _ = V.cells.locate(faces, uv, corners)
     cell = V.cells.piece_cell[piece]
     np.testing.assert_allclose(on_cells.eval(faces, uv, corners), np.column_stack([2 * cell, 2 * cell + 1]), rtol=1e-13)
-    assert on_cells.copy().space == on_cells.space
+    assert on_cells.copy().function_space == on_cells.function_space
     assert on_cells.local_coefficients().shape == (V.cells.num_pieces, 16, 2)
 
 

@@ -240,8 +240,7 @@ def test_a_pressurised_cylinder_between_diaphragms() -> None:
         V = fem.functionspace(msh, VECTOR)
         x, v = ufl.SpatialCoordinate(msh), ufl.TestFunction(V)
         rims = fem.boundary_dofs(V)
-        bcs = [fem.dirichletbc(0.0, rims, V.sub(c)) for c in (0, 1)]
-        bcs.append(fem.dirichletbc(0.0, rims[:1], V.sub(2)))  # one coefficient: no motions along the axis
+        bcs = [fem.dirichletbc(0.0, rims, V.sub(c)) for c in (0, 1)]  # free along the axis: the mean of u_z is zero
         pressure = p * ufl.CellNormal(msh.ufl_domain())
         uh = LinearProblem(work(V, E, 0.0, t), shell.L(pressure, v), bcs=bcs).solve()
         s = beta * x[2]

@@ -335,6 +335,33 @@ def test_loads_with_a_mean_are_named_with_it(mean: float) -> None:
     LinearSystem(laplace(V), (x[0] - centre + mean - named) * v * dx).assemble()  # as the message says
 
 
+def test_loads_may_be_rounding_of_other_components() -> None:
+    # The third component has nothing but rounding, whose mean is not small against itself.
+    V = torus((3,))
+    noise = np.zeros(V.num_dofs)
+    noise[2::3] = 1e-17
+    v = ufl.TestFunction(V)
+    x = ufl.SpatialCoordinate(V.mesh)
+    first = [fem.dirichletbc(0.0, [0], V.sub(c)) for c in (0, 1)]
+    system = LinearSystem(laplace(V), inner(x, ufl.as_vector([1.0, 2.0, 0.0])) * (v[0] + v[1]) * dx, bcs=first)
+    system.load = noise
+    system.assemble()
+    assert system.constants is not None
+    assert system.constants.num_constants == 1
+    system.load = 1e6 * noise  # 1e-11 is no rounding of loads of 1
+    with pytest.raises(ValueError, match="there is no solution"):
+        system.assemble()
+
+
+def test_loads_of_one_unknown_are_no_rounding_of_those_of_another() -> None:
+    V = torus()
+    u, w = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a = [[inner(grad(u), grad(w)) * dx, None], [None, inner(grad(u), grad(w)) * dx + u * w * dx]]
+    tiny = fem.Constant(V.mesh, 1e-15)
+    with pytest.raises(ValueError, match="there is no solution"):
+        LinearSystem(a, [tiny * w * dx, fem.Constant(V.mesh, 1.0) * w * dx]).assemble()
+
+
 def test_loads_of_components_are_named_with_all_means() -> None:
     V = torus((2,))
     system = LinearSystem(laplace(V), 3.0 * ufl.TestFunction(V)[1] * dx)

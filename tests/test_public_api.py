@@ -83,6 +83,7 @@ SIGNATURES = {
     "fem.petsc.assemble_vector": "form, /",
     "fem.petsc.apply_lifting": "b, a, bcs, /",
     "fem.petsc.set_bc": "b, bcs, /",
+    "fem.petsc.multigrid": "ksp, V",
     "estimate.error": "uh, u_exact, norm='L2'",
     "estimate.residual": "uh, strong_residual, neumann=None, flux=None",
     "estimate.bubble": "uh, a, L",

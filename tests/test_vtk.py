@@ -10,9 +10,9 @@ from vtkmodules.vtkCommonCore import reference
 from vtkmodules.vtkCommonDataModel import vtkHigherOrderQuadrilateral
 from zoo import ZOO
 
-from thccs_fem import generators, io, limit, vtk
+from thccs_fem import adapt, generators, io, limit, vtk
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.space import FunctionSpace, functionspace
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, cellwise, functionspace
 from thccs_fem.mesh import ControlMesh
 
 EXACT = 1e-12  # 16 terms of sizes up to 10
@@ -37,7 +37,7 @@ def position(V: FunctionSpace) -> Function:
     return x
 
 
-def some_function(V: FunctionSpace, name: str = "u") -> Function:
+def some_function(V: FunctionSpace | CellwiseSpace, name: str = "u") -> Function:
     u = Function(V, name)
     u.x.array = np.random.default_rng(3).uniform(-1.0, 1.0, V.num_dofs)
     return u
@@ -129,6 +129,27 @@ def test_several_functions_from_spaces_of_their_own() -> None:
         np.testing.assert_allclose(grid.point_data["d"][:, c], component, rtol=0, atol=EXACT)
 
 
+@pytest.mark.parametrize("name", ["wheel5", "pyramid"])
+def test_constants_on_faces_and_cells_go_along(name: str) -> None:
+    coarse = functionspace(ZOO[name](), ("THCCS", 3), boundary="crease")
+    V = adapt.refine(adapt.refine(coarse, [0]), [1])
+    u, k = some_function(V), Function(functionspace(V.mesh, ("DG", 0)), "k")
+    k.x.array = np.arange(V.mesh.num_faces)
+    q, r = some_function(cellwise(V, (2,)), "q"), some_function(cellwise(coarse), "r")
+    for functions in ([u, k, q, r], [k, r, u, q], [r, k, q]):
+        grid = vtk.bezier_grid(functions)
+        assert grid.n_cells == V.cells.num_pieces
+        at = {f: grid.point_data[f].reshape(grid.n_cells, 16, -1) for f in grid.point_data.keys()}
+        on_faces = np.repeat(grid.cell_data["face"][:, None], 16, axis=1)
+        np.testing.assert_allclose(at["k"][:, :, 0], on_faces, atol=EXACT)
+        on_cells = q.x.array.reshape(-1, 2)[grid.cell_data["cell"]]
+        np.testing.assert_allclose(at["q"][:, :, :2], np.repeat(on_cells[:, None], 16, axis=1), atol=EXACT)
+        assert np.unique(at["r"].round(12)).size == coarse.num_cells
+    np.testing.assert_array_equal(vtk.bezier_grid([k, u]).point_data["u"], vtk.bezier_grid(u).point_data["u"])
+    with pytest.raises(ValueError, match=r"elements of the functions differ"):
+        vtk.bezier_grid([some_function(coarse), q])
+
+
 def test_vectors_of_other_lengths_keep_them() -> None:
     for k in (1, 3, 4):
         values = vtk.bezier_grid(some_function(space(ZOO["torus"](), (k,)))).point_data["u"]
@@ -150,11 +171,11 @@ def test_what_can_not_be_written(tmp_path: Path) -> None:
         vtk.write_vtu(file, [])
     with pytest.raises(TypeError, match="got FunctionSpace"):
         vtk.write_vtu(file, [u, V])  # type: ignore[list-item]  # wrong on purpose
-    with pytest.raises(ValueError, match=r"elements of 'v' .* are not those of 'u'.*adapt\.transfer"):
+    with pytest.raises(ValueError, match=r"(?s)elements of the functions differ.*'u': .*'v': .*adapt\.transfer"):
         vtk.write_vtu(file, [u, some_function(functionspace(mesh, ("THCCS", 3)), "v")])
     wheel = ZOO["wheel5"]()
     one, other = (functionspace(wheel, ("THCCS", 3), cap_level=k) for k in (3, 4))  # the same cells, other pieces
-    with pytest.raises(ValueError, match=r"elements of 'v' .* are not those of 'u'"):
+    with pytest.raises(ValueError, match="elements of the functions differ"):
         vtk.write_vtu(file, [some_function(one), some_function(other, "v")])
     with pytest.raises(ValueError, match=r"called \['u', 'u'\].*Function\.name"):
         vtk.write_vtu(file, [u, u.copy()])

@@ -55,7 +55,7 @@ def _old_vertices(level: Level) -> Bools | None:
     if side is None:
         return None
     old = even & (side == side[first][part])
-    fits = old | (level.regular & np.where(even, ~level.boundary, ~level.corner))
+    fits = old | (level.regular & ~(even & level.boundary))
     return old if fits.all() else None
 
 

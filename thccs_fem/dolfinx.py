@@ -109,7 +109,7 @@ def function(uh: Function) -> dolfinx.fem.Function[np.float64]:
     Raises:
         TypeError, NotImplementedError: As for `mesh`.
     """
-    V = uh.space
+    V = uh.ufl_function_space()
     Q = functionspace(V)
     result: dolfinx.fem.Function[np.float64] = dolfinx.fem.Function(Q, name=uh.name, dtype=np.float64)
     values = _at_nodes(Q) @ uh.local_coefficients()[_piece(Q)]

@@ -21,8 +21,7 @@ import numpy.typing as npt
 from thccs_fem import element
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.hierarchy import Hierarchy
+from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.subdivision import Ints
 
 if TYPE_CHECKING:  # imported where it is needed: it takes its time
@@ -48,7 +47,8 @@ def write_vtu(
 
     Args:
         filename: The file, ending in .vtu; its directory must exist.
-        uh: A function, several on the same elements, or a space.
+        uh: A function, several on the same elements, or a space. Functions that are constant on the faces of the
+            control mesh, or on coarser cells, may be among several.
         cell_data: Values for each cell by name, such as estimates, each of shape (num_cells,).
 
     Raises:
@@ -102,14 +102,15 @@ def bezier_grid(
     """
     import pyvista
 
-    cells, functions = _cells_and_functions(uh)
+    V, functions = _space_and_functions(uh)
+    cells = V.cells
     num_points = element.NUM_FUNCTIONS * cells.num_pieces
     quads = np.arange(num_points).reshape(-1, element.NUM_FUNCTIONS)
     connectivity = np.insert(quads, 0, element.NUM_FUNCTIONS, axis=1)
     types = np.full(cells.num_pieces, pyvista.CellType.BEZIER_QUADRILATERAL, dtype=np.uint8)
     grid = pyvista.UnstructuredGrid(connectivity.ravel(), types, in_space(_bernstein(cells.piece_points)))
     for f in functions:
-        values = _bernstein(f.local_coefficients())
+        values = _bernstein(f.local_coefficients(V))
         grid.point_data[f.name] = in_space(values) if values.shape[1] == 2 else values
     for name, numbers in cell_numbers(cells).items():
         grid.cell_data[name] = numbers
@@ -136,31 +137,35 @@ def _bernstein(local: Floats) -> Floats:
     return (element.TO_BERNSTEIN[VTK_ORDER] @ local).reshape(-1, local.shape[2])
 
 
-def _cells_and_functions(uh: object) -> tuple[Cells, list[Function]]:
-    """Return the cells and the functions on them that a user gave."""
+def _space_and_functions(uh: object) -> tuple[FunctionSpace | CellwiseSpace, list[Function]]:
+    """Return the functions that a user gave, and the space whose elements they are written on."""
     if isinstance(uh, FunctionSpace):
-        return uh.cells, []
+        return uh, []
     functions = [uh] if isinstance(uh, Function) else list(uh) if isinstance(uh, Iterable) else []
     strange = next((f for f in functions if not isinstance(f, Function)), None if functions else uh)
     if strange is not None:
         raise TypeError(
             f"expected a Function, a sequence of Functions or a FunctionSpace, got {type(strange).__name__}"
         )
-    first = functions[0].function_space
-    for f in functions[1:]:
-        if not _same_pieces(f.function_space.hierarchy, first.hierarchy):
-            raise ValueError(
-                f"the elements of {f.name!r} ({f.function_space!r}) are not those of {functions[0].name!r} "
-                f"({first!r}): carry the coarser function over with adapt.transfer, or write two files"
-            )
     names = [f.name for f in functions]
     if len(set(names)) < len(names):
         raise ValueError(f"the functions are called {names}, but two names in one file must differ: set Function.name")
-    return first.cells, functions
+    spaces = [f.ufl_function_space() for f in functions]
+    for V in spaces:
+        if all(_is_on_elements_of(V, W) for W in spaces):
+            return V, functions
+    listed = "\n".join(f"  {f.name!r}: {f.ufl_function_space()}" for f in functions)
+    raise ValueError(
+        f"the elements of the functions differ:\n{listed}\nCarry the coarser ones over with adapt.transfer, or write "
+        f"several files"
+    )
 
 
-def _same_pieces(one: Hierarchy, other: Hierarchy) -> bool:
-    return one.same_as(other) and np.array_equal(one.cap_levels, other.cap_levels)
+def _is_on_elements_of(V: FunctionSpace | CellwiseSpace, W: FunctionSpace | CellwiseSpace) -> bool:
+    """Return whether functions of W are known on the elements of V; those that are constant on cells may be coarser."""
+    if isinstance(W, CellwiseSpace) or V.hierarchy is None:
+        return V.is_refinement_of(W)
+    return V.hierarchy.same_as(W.hierarchy) and np.array_equal(V.hierarchy.cap_levels, W.hierarchy.cap_levels)
 
 
 def one_for_each_cell(cells: Cells, name: str, values: npt.ArrayLike) -> npt.NDArray[np.generic]:

@@ -1,38 +1,27 @@
 """Strong Dirichlet conditions: which degrees of freedom, and which values.
 
 Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of
-a function, or one through `V.sub(c)`.  No spline interpolates: an expression is projected, in L2 of the boundary edges
-that the named functions determine, or of the cells if not all of them reach the boundary.  Equations of fourth order
-prescribe the slope as well, the derivative along the conormal of the boundary: `slope=True`.
+a function, or one through `V.sub(c)`. Equations of fourth order prescribe the slope as well, the derivative along the
+conormal of the boundary: `slope=True`. What expressions become is in `fitting`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 import ufl
-from thccs_fem import element
-from thccs_fem.extraction import Cells, evaluate_pieces
-from thccs_fem.fem.expression import ValueOrExpression, values_at
+from thccs_fem.extraction import evaluate_pieces
+from thccs_fem.fem.expression import ValueOrExpression
+from thccs_fem.fem.fitting import fitted, side_rows
 from thccs_fem.fem.function import Constant
 from thccs_fem.fem.space import Component, FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["DirichletBC", "boundary_dofs", "dirichletbc", "locate_dofs_geometrical", "region_dofs"]
-
-NONZERO = 1e-10  # extraction entries are 0 up to rounding or a good part of 1 in some piece of the cell
-AROUND = 1e-6  # weight of a value around the part that is prescribed, against 1 in it
-RIDGE = 1e-13  # makes regular what is determined nowhere; no more than rounding elsewhere
-NUM_GAUSS = 8  # points in each direction: exact for straight pieces, far below the error of the space for others
-SIDES = np.array([[0, 1, 2, 3], [3, 7, 11, 15], [15, 14, 13, 12], [12, 8, 4, 0]])  # coefficients i + 4 j on each side
-INWARD = np.array([4, -1, -4, 1])  # from these to the next row inside
 
 Floats = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.integer]
@@ -98,7 +87,7 @@ def boundary_dofs(
         points = cells.piece_points[piece]
         for position in (corners[side], middle[side], corners[(side + 1) % 4]):
             chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
-    rows = _side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
+    rows = side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
     return np.unique(rows.indices).astype(np.int32)
 
 
@@ -158,7 +147,7 @@ def dirichletbc(
     if isinstance(value, Constant):
         value = value.value
     if isinstance(value, ufl.core.expr.Expr) or callable(value):
-        values = _projected(space, functions, value, components.size, slope)
+        values = fitted(space, functions, value, components.size, slope)
     else:
         values = _broadcast(np.array(value, dtype=np.float64), dofs, functions, components.size)
         if not np.isfinite(values).all():
@@ -211,202 +200,3 @@ def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
     tagged = np.zeros(mesh.num_edges, dtype=bool)
     tagged[mesh.edge_indices(np.array(pairs, dtype=np.int32).reshape(-1, 2))] = True
     return tagged[mesh.face_edges]
-
-
-def _side_rows(cells: Cells, piece: Ints, side: Ints, depth: int) -> sp.csr_array:
-    """Return Bernstein coefficients at the sides of pieces, without rounding errors, shape (4 depth n, num_functions).
-
-    The four on the side come first; with `depth` 2 those of the next row inside follow, which make up the slope.
-    """
-    to_bernstein = sp.kron(sp.eye_array(piece.size, format="csr"), sp.csr_array(element.TO_BERNSTEIN), format="csr")
-    local = SIDES[side][:, None] + np.arange(depth)[:, None] * INWARD[side][:, None, None]
-    rows = 16 * np.arange(piece.size)[:, None] + local.reshape(piece.size, 4 * depth)
-    coefficients = sp.csr_array(sp.csr_array(to_bernstein[rows.ravel()]) @ cells.rows(piece))
-    coefficients.data[np.abs(coefficients.data) < NONZERO] = 0.0
-    coefficients.eliminate_zeros()
-    return coefficients
-
-
-def _projected(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, slope: bool) -> Floats:
-    """Return the coefficients of the L2 projection of an expression on the functions, shape (functions, k).
-
-    What is fitted by least squares is the value (and the slope) on the part of the boundary or of the surface that the
-    given functions determine, together with all other functions there, and, with a small weight, the value around it:
-    functions that hardly reach into the part, or that others can stand in for there, are determined by that.
-    """
-    if not functions.size:
-        return np.zeros((0, k))
-    if slope:
-        parts = (_value_and_slope(V, functions, value, k), _on_cells(V, functions, value, k, is_around=True))
-        basis = sp.csr_array(sp.vstack([part[0] for part in parts], format="csr"))
-        weights, values = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
-    else:
-        basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
-    weights = np.where(np.isfinite(values).all(axis=1), weights, 0.0)  # around the part, it need not be defined
-    weighted = sp.csr_array(sp.diags_array(weights) @ basis)
-    present = np.unique(weighted.indices)
-    mass = sp.csc_array((basis.T @ weighted)[present][:, present])
-    load = (weighted.T @ np.nan_to_num(values))[present]
-    regular = mass.copy()
-    regular.setdiag((1.0 + RIDGE) * mass.diagonal())
-    factors = spla.splu(regular)
-    fitted = factors.solve(load)
-    fitted += factors.solve(load - mass @ fitted)  # takes back what RIDGE has changed
-    return fitted[np.searchsorted(present, functions)]
-
-
-def _on_boundary(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
-) -> tuple[sp.csr_array, Floats, Floats] | None:
-    """Return basis, weights and values at Gauss points of the boundary; None if a function has no trace there."""
-    piece, side, _ = V.cells.boundary_pieces
-    rows = _side_rows(V.cells, piece, side, depth=1)
-    if not np.isin(functions, rows.indices).all():
-        return None
-    chosen, is_inside = _blocks(rows, functions, 4)
-    sides = _Sides(V, piece[chosen], side[chosen])
-    basis = sides.table(element.bernstein_values(sides.t)) @ rows[(4 * chosen[:, None] + np.arange(4)).ravel()]
-    values = sides.values_of(value, k)
-    return sp.csr_array(basis), _weighted(sides.lengths, values, is_inside), values.reshape(-1, k)
-
-
-def _value_and_slope(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
-) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the boundary, then the same of h times the slope.
-
-    h is the width of the piece across the boundary, so that values and slopes weigh alike at every size of the cells.
-
-    Raises:
-        TypeError: If the value is no UFL expression, which alone can be differentiated.
-        ValueError: If a function has neither value nor slope on the boundary.
-    """
-    if not isinstance(value, ufl.core.expr.Expr):
-        raise TypeError(f"slope=True needs a UFL expression, whose gradient is known, got {type(value).__name__}")
-    piece, side, _ = V.cells.boundary_pieces
-    rows = _side_rows(V.cells, piece, side, depth=2)
-    inside = functions[~np.isin(functions, rows.indices)]
-    if inside.size:
-        raise ValueError(
-            f"{inside.size} of the {functions.size} dofs have neither value nor slope on the boundary, the first is "
-            f"{inside[0]}: slope=True is for dofs of boundary_dofs(V, slope=True)"
-        )
-    chosen, is_inside = _blocks(rows, functions, 8)
-    sides = _Sides(V, piece[chosen], side[chosen])
-    values = sides.values_of(value, k)
-    gradients = sides.values_of(ufl.grad(value), k * V.mesh.gdim).reshape(*values.shape, V.mesh.gdim)
-    slopes = np.einsum("nqkc,nqc->nqk", gradients, sides.across)
-    rows = sp.csr_array(rows[(8 * chosen[:, None] + np.arange(8)).ravel()])
-    both = np.concatenate([values, slopes], axis=1)
-    weights = _weighted(np.tile(sides.lengths, 2), both, is_inside)
-    return sp.csr_array(sides.table(sides.value_and_slope()) @ rows), weights, both.reshape(-1, k)
-
-
-class _Sides:
-    """Gauss points on sides of pieces, and the geometry there.
-
-    Attributes:
-        t: Points along a side, shape (q,).
-        tangent: Derivative of the position along the side, shape (n, q, gdim).
-        inward: Derivative of the position along the other parameter, shape (n, q, gdim).
-    """
-
-    def __init__(self, V: FunctionSpace, piece: Ints, side: Ints):
-        self.V, self.piece, self.side = V, piece, side
-        self.t, self.w = _gauss()
-        control = element.TO_BERNSTEIN @ V.cells.piece_points[piece]
-        first, second = (
-            control[np.arange(piece.size)[:, None], SIDES[side] + j * INWARD[side][:, None]] for j in (0, 1)
-        )
-        self.tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(self.t), first)
-        self.inward = np.einsum("qi,nic->nqc", element.bernstein_values(self.t), 3.0 * (second - first))
-
-    @property
-    def lengths(self) -> Floats:
-        """Weights of the Gauss points in integrals over the sides, shape (n, q)."""
-        return np.linalg.norm(self.tangent, axis=2) * self.w
-
-    @cached_property
-    def shear(self) -> Floats:
-        """What of the tangent is in `inward`, shape (n, q)."""
-        return (self.inward * self.tangent).sum(axis=2) / (self.tangent**2).sum(axis=2)
-
-    @property
-    def across(self) -> Floats:
-        """The conormal, as long as the piece is wide, inwards, shape (n, q, gdim)."""
-        return self.inward - self.shear[..., None] * self.tangent
-
-    def values_of(self, value: ValueOrExpression, k: int) -> Floats:
-        """Return values with k components, shape (n, q, k)."""
-        start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        along = np.roll(start, -1, axis=0) - start
-        points = start[:, None] + along[:, None] * self.t[:, None]  # (4 sides, Gauss points, 2)
-        values = values_at(value, self.V, self.piece, points.reshape(-1, 2), k)
-        return values.reshape(self.piece.size, 4, self.t.size, k)[np.arange(self.piece.size), self.side]
-
-    def value_and_slope(self) -> Floats:
-        """Return the eight functions of two rows at the points, then their derivatives along `across`, (n, 2 q, 8)."""
-        value = np.broadcast_to(element.bernstein_values(self.t), (*self.shear.shape, 4))
-        along = self.shear[..., None] * element.bernstein_slopes(self.t)
-        first = np.concatenate([value, -3.0 * value - along], axis=1)
-        second = np.concatenate([np.zeros_like(value), 3.0 * value], axis=1)
-        return np.concatenate([first, second], axis=2)
-
-    def table(self, values: Floats) -> sp.csr_array:
-        """Return a table of local functions of each side, or one for all, as a matrix of diagonal blocks."""
-        values = np.broadcast_to(values, (self.piece.size, *values.shape[-2:]))
-        n, rows, columns = values.shape
-        indices = np.broadcast_to(np.arange(n * columns).reshape(n, 1, columns), values.shape)
-        indptr = columns * np.arange(n * rows + 1)
-        return sp.csr_array((values.ravel(), indices.ravel(), indptr), shape=(n * rows, n * columns))
-
-
-def _on_cells(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, is_around: bool = False
-) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the pieces that the functions live on.
-
-    With `is_around` all of them are around what is prescribed.
-    """
-    cells = V.cells
-    all_rows = cells.rows(np.arange(cells.num_pieces, dtype=np.int32))
-    piece, is_inside = _blocks(all_rows, functions, 16)
-    is_inside &= not is_around
-    t, w = _gauss()
-    points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
-    basis = element.bspline_values(points)
-    table = (basis[:, 1, :, None] * basis[:, 0, None, :]).reshape(-1, 16)
-    rows = sp.csr_array(all_rows[(16 * piece[:, None] + np.arange(16)).ravel()])
-    at_points = sp.csr_array(sp.kron(sp.eye_array(piece.size), sp.csr_array(table), format="csr") @ rows)
-    weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
-    values = values_at(value, V, piece, points, k)
-    return at_points, _weighted(weights, values, is_inside), values.reshape(-1, k)
-
-
-def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
-    """Return the blocks of `height` rows where given functions occur, and in which of these no others do."""
-    given = np.zeros(rows.shape[1], dtype=bool)
-    given[functions] = True
-    block = np.repeat(np.arange(rows.shape[0]) // height, np.diff(rows.indptr))
-    num_given, num_foreign = (
-        np.bincount(block, weights=marks[rows.indices], minlength=rows.shape[0] // height) for marks in (given, ~given)
-    )
-    chosen = np.flatnonzero(num_given).astype(np.int32)
-    return chosen, num_foreign[chosen] == 0
-
-
-def _weighted(weights: Floats, values: Floats, is_inside: Bools) -> Floats:
-    """Return the weights of shape (n, points), made small outside, in one row."""
-    bad = ~np.isfinite(values).all(axis=(1, 2)) & is_inside
-    if bad.any():
-        raise ValueError(
-            f"the value is not finite on {np.count_nonzero(bad)} of the {np.count_nonzero(is_inside)} edges or patches "
-            f"of surface that the dofs determine: prescribe finite values"
-        )
-    return (weights * np.where(is_inside, 1.0, AROUND)[:, None]).ravel()
-
-
-def _gauss() -> tuple[Floats, Floats]:
-    """Return Gauss points and weights on [0, 1]."""
-    t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
-    return (t + 1.0) / 2.0, w / 2.0

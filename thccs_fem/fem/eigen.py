@@ -2,11 +2,16 @@
 
 Prescribed dofs are left out of the matrices: rows of the identity in their place would add eigenvalues of their own.
 The spectrum is transformed by (A - s M)^-1, which needs a shift s at which that matrix is regular.
+
+From one vector, Krylov methods come to but one eigenvector of a multiple eigenvalue; to the others rounding leads them,
+sooner or later, and a copy may be missing when they stop. So eigenvalues are counted: where A - s M = L D L^T, as many
+are below s as D has negative entries (Sylvester's law of inertia; Grimes, Lewis and Simon, A shifted block Lanczos
+algorithm, SIAM J. Matrix Anal. Appl. 15, 1994, sec. 3.3). What is missing is searched for beside what was found.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -20,12 +25,17 @@ from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import constraints, is_symmetric
 from thccs_fem.subdivision import Ints
 
-__all__ = ["EigenSystem", "start_vector"]
+__all__ = ["EigenSystem"]
 
 Floats = npt.NDArray[np.float64]
 
 AWAY = 0.1  # how far the shift goes below the target, in units of the Rayleigh quotient of a long wave
 EQUAL = 1e-6  # relative difference of coefficients that count as equally large when the sign is chosen
+SAME = 1e-6  # relative difference of distances from the target that count as one
+ROUNDING = 1e-12  # of eigenvalues, relative to the largest of all
+ROUNDS = 20  # searches for missing eigenvalues, of which each finds one at least
+
+Search = Callable[[int, Floats, Floats], tuple[Floats, Floats]]
 
 
 class EigenSystem:
@@ -62,8 +72,10 @@ class EigenSystem:
         self.m = form(mass if m is None else m)
         if self.m.spaces != self.a.spaces:
             raise ValueError(f"m has arguments in {[str(V) for V in self.m.spaces]}, but those of a are in {V}")
-        if num_eigenvalues < 1:
-            raise ValueError(f"num_eigenvalues is {num_eigenvalues}: ask for one or more")
+        if not isinstance(num_eigenvalues, int | np.integer) or num_eigenvalues < 1:
+            raise ValueError(f"num_eigenvalues is {num_eigenvalues}: ask for one or more, a whole number")
+        if not np.isfinite(target):
+            raise ValueError(f"target is {target}: give the number that the eigenvalues are to be nearest to")
         self.bcs = bcs
         self.num_eigenvalues = num_eigenvalues
         self.target = target
@@ -121,6 +133,56 @@ class EigenSystem:
         w = np.repeat(wave, V.block_size)[self.free]
         return self.target - AWAY * abs(float(w @ (self.A @ w) / (w @ (self.M @ w))))
 
+    def complete(self, search: Search, count: Callable[[float], int] | None) -> tuple[Floats, Floats]:
+        """Return the eigenvalues nearest to the target, none of them missing, or fewer if a search finds fewer.
+
+        The last of them may be copies of one eigenvalue that has more.
+
+        Args:
+            search: Returns at least as many eigenvalues as wanted, if they converge, and their vectors as columns, from
+                their number, the vectors (shape (n, k)) to which theirs are to be m-orthogonal, and a vector to start
+                from.
+            count: Returns how many eigenvalues there are below a number; None: what the first search finds is taken.
+
+        Returns:
+            Eigenvalues, those wanted first, shape (k,), and their vectors, shape (n, k).
+
+        Raises:
+            RuntimeError: The numbers of those found and those counted never agree.
+        """
+        values, vectors = np.zeros(0), np.zeros((self.free.size, 0))
+        missing = self.num_eigenvalues
+        if count is None:
+            return search(missing, vectors, _start_vector(self.M, 0))
+        for seed in range(ROUNDS):
+            more = search(missing, vectors, _start_vector(self.M, seed))
+            values, vectors = np.append(values, more[0]), np.hstack([vectors, more[1]])
+            nearest = np.argsort(np.abs(values - self.target), kind="stable")
+            values, vectors = values[nearest], vectors[:, nearest]
+            if values.size < self.num_eigenvalues:
+                return values, vectors
+            missing = self._missing(values, count)
+            if missing == 0:
+                return values, vectors
+            if missing < 0 or more[0].size == 0:
+                break
+        raise RuntimeError(
+            f"of the {self.num_eigenvalues} eigenvalues nearest to {self.target:g}, {abs(missing)} "
+            f"{'are missing' if missing > 0 else 'are too many'}, as the signs of pivots of A - s M tell. What may "
+            f"help: another target; see that m is positive, as the square of a norm"
+        )
+
+    def _missing(self, eigenvalues: Floats, count: Callable[[float], int]) -> int:
+        """Return how many more eigenvalues there are nearer to the target than the last one wanted, and its copies."""
+        distances = np.abs(eigenvalues - self.target)[: self.num_eigenvalues]
+        largest = (np.abs(self.A.diagonal()) / self.M.diagonal()).max()
+        same = max(SAME * distances[-1], ROUNDING * largest)
+        first = int(np.flatnonzero(np.diff(distances, prepend=-np.inf) > same)[-1])  # of the last one's copies
+        radius = distances[first] - same / 2.0
+        if radius <= 0.0:
+            return 0
+        return count(self.target + radius) - count(self.target - radius) - first
+
     def accept(self, eigenvalues: Floats, vectors: Floats, solver: str) -> tuple[Floats, list[Function]]:
         """Return eigenvalues in ascending order, and their functions with m-norm 1 and a sign of our choice.
 
@@ -153,6 +215,6 @@ class EigenSystem:
         return whole if self.free.size == whole.shape[0] else sp.csr_array(whole[self.free][:, self.free])
 
 
-def start_vector(M: sp.csr_array) -> Floats:
-    """Return what Krylov methods start from: the same at every call, with a part along every eigenvector."""
-    return np.asarray(M @ np.random.default_rng(0).standard_normal(M.shape[0]))
+def _start_vector(M: sp.csr_array, seed: int) -> Floats:
+    """Return what Krylov methods start from: the same for the same seed, with a part along every eigenvector."""
+    return np.asarray(M @ np.random.default_rng(seed).standard_normal(M.shape[0]))

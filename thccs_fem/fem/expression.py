@@ -81,13 +81,8 @@ def _local(u: Function, V: FunctionSpace) -> Floats:
 
     Or (num_pieces, 1, block_size) if u is constant on each cell.
     """
-    W = u.space
-    if isinstance(W, CellwiseSpace):
-        return u.x.array.reshape(-1, 1, W.block_size)[W.dofs_of(V.cells)[V.cells.piece_cell]]
-    if W.hierarchy is V.hierarchy:
-        return u.local_coefficients()
-    x = V.hierarchy.prolongation(W.hierarchy) @ u.x.array.reshape(-1, W.block_size)
-    return V.cells.local(x)
+    local = u.local_coefficients(V)
+    return local[:, :1] if isinstance(u.ufl_function_space(), CellwiseSpace) else local
 
 
 def values_at(value: ValueOrExpression, V: FunctionSpace, pieces: Ints, points: Floats, k: int) -> Floats:

@@ -51,13 +51,16 @@ class Function(ufl.Coefficient):
 
     @property
     def function_space(self) -> FunctionSpace:
-        """The space; for the type checker a THCCS space, which nearly all are."""
-        return self.ufl_function_space()  # type: ignore[no-untyped-call]  # as above
+        """The space.
 
-    @property
-    def space(self) -> FunctionSpace | CellwiseSpace:
-        """The space, of either kind."""
-        return self.ufl_function_space()  # type: ignore[no-untyped-call]  # as above
+        For type checkers a THCCS space, which nearly all functions are in; where one that is constant on each cell may
+        come, `ufl_function_space` says so.
+        """
+        return self.ufl_function_space()  # type: ignore[return-value]  # as documented
+
+    def ufl_function_space(self) -> FunctionSpace | CellwiseSpace:
+        """Return the space, of either kind."""
+        return super().ufl_function_space()  # type: ignore[no-untyped-call]  # as above
 
     @property
     def x(self) -> Vector:
@@ -70,12 +73,26 @@ class Function(ufl.Coefficient):
         other.x.array = self.x.array
         return other
 
-    def local_coefficients(self) -> npt.NDArray[np.float64]:
-        """Return the local B-spline coefficients of each piece, shape (num_pieces, 16, block_size)."""
-        V, values = self.space, self.x.array.reshape(-1, self.space.block_size)
-        if isinstance(V, CellwiseSpace):  # the local functions add up to one
-            return np.repeat(values[V.dofs_of(V.cells)[V.cells.piece_cell], None], NUM_FUNCTIONS, axis=1)
-        return V.cells.local(values)
+    def local_coefficients(self, V: FunctionSpace | CellwiseSpace | None = None) -> npt.NDArray[np.float64]:
+        """Return the local B-spline coefficients on each piece of a space.
+
+        Args:
+            V: A refinement of the function's space; None: that space.
+
+        Returns:
+            Shape (num_pieces, 16, block_size).
+
+        Raises:
+            ValueError: If V is no refinement.
+        """
+        own = self.ufl_function_space()
+        values = self.x.array.reshape(-1, own.block_size)
+        cells = own.cells if V is None else V.cells
+        if isinstance(own, CellwiseSpace):  # the local functions add up to one
+            return np.repeat(values[own.dofs_of(cells)[cells.piece_cell], None], NUM_FUNCTIONS, axis=1)
+        if cells.hierarchy is not own.hierarchy:
+            values = cells.hierarchy.prolongation(own.hierarchy) @ values
+        return cells.local(values)
 
     def eval(
         self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
@@ -93,7 +110,7 @@ class Function(ufl.Coefficient):
         Raises:
             ValueError: If a face, coordinate or corner is out of range.
         """
-        V = self.space
+        V = self.ufl_function_space()
         piece, position = V.cells.locate(faces, uv, corner)
         if isinstance(V, CellwiseSpace):
             values = self.x.array.reshape(-1, V.block_size)[V.dofs_of(V.cells)[V.cells.piece_cell[piece]]]
@@ -127,6 +144,14 @@ class Constant(ufl.Constant):
     def __init__(self, domain: ControlMesh, c: npt.ArrayLike):
         self._value = np.array(c, dtype=np.float64)
         super().__init__(domain.ufl_domain(), self._value.shape)  # type: ignore[no-untyped-call]  # as above
+
+    def __repr__(self) -> str:
+        """Return the text by which UFL sorts the factors of a product.
+
+        The number has leading zeros: else 10 came before 9, and a form with these two would be another one, with a
+        kernel of its own, than the same form with 8 and 9.
+        """
+        return f"Constant({self._ufl_domain!r}, {self._ufl_shape!r}, {self._count:012d})"
 
     @property
     def value(self) -> Any:

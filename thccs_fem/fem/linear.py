@@ -48,6 +48,7 @@ SYMMETRIC = 1e-11  # difference of two entries, relative to the largest one
 VANISHING = 1e-13  # sum of a row, relative to that of absolute values; second-order forms come to 3e-15
 PRESCRIBED = 1e-6  # the same, where but for prescribed values it is zero by the form; fourth-order ones come to 1e-10
 INCOMPATIBLE = 1e-6  # mean of a load, relative to that of its absolute value; less is left by quadrature
+ROUNDING = 1e-12  # the same, relative to all components: one may be but rounding of the others
 LARGEST_CONDITION = 1e12  # of a scaled matrix; singular ones come to 1e13 and more, fine fourth-order ones to 1e8
 
 
@@ -155,12 +156,12 @@ class LinearSystem:
 # ---- Dirichlet conditions --------------------------------------------------------------------------------------------
 
 
-def constrain(A: sp.csr_array, dofs: Ints) -> None:
-    """Make rows and columns of dofs those of the identity, in place; entries off the diagonal stay as zeros."""
+def constrain(A: sp.csr_array, dofs: Ints, *, columns: bool = True) -> None:
+    """Make rows of dofs those of the identity, and columns too, in place; entries off the diagonal stay as zeros."""
     prescribed = np.zeros(A.shape[0], dtype=bool)
     prescribed[dofs] = True
     rows = np.repeat(np.arange(A.shape[0], dtype=np.int32), np.diff(A.indptr))
-    A.data[prescribed[rows] | prescribed[A.indices]] = 0.0
+    A.data[prescribed[rows] | (columns & prescribed[A.indices])] = 0.0
     A.data[prescribed[rows] & (rows == A.indices)] = 1.0
 
 
@@ -174,14 +175,17 @@ class Constants:
     Attributes:
         number: Which of them has coefficient 1 at each dof (at most one has), or -1, shape (num_dofs,).
         integrals: Integral of the function of each dof, shape (num_dofs,).
+        load: Which load each dof is loaded by, one for all components of an unknown on one connected part of the
+            surface, which have one unit; -1 where it is prescribed. Shape (num_dofs,).
     """
 
     number: Ints
     integrals: Floats
+    load: Ints
 
     def __post_init__(self) -> None:
-        self.number.setflags(write=False)
-        self.integrals.setflags(write=False)
+        for array in (self.number, self.integrals, self.load):
+            array.setflags(write=False)
 
     @property
     def num_constants(self) -> int:
@@ -210,14 +214,16 @@ class Constants:
         return b - self.integrals * self.spread(self.sums(b) / self.areas)
 
     def check_load(self, b: Floats) -> None:
-        """Raise if the mean of a load is more than what quadrature leaves.
+        """Raise if the mean of a load is more than what quadrature leaves, and rounding in other components.
 
         Raises:
             ValueError: It is.
         """
         totals = self.sums(b)
         means = totals / self.areas
-        if (np.abs(totals) > INCOMPATIBLE * self.sums(np.abs(b))).any():
+        _, first = np.unique(self.number, return_index=True)
+        of_all = np.bincount(self.load + 1, weights=np.abs(b))[1:][self.load[first[-self.num_constants :]]]
+        if (np.abs(totals) > INCOMPATIBLE * self.sums(np.abs(b)) + ROUNDING * of_all).any():
             listed = ", ".join(repr(float(mean)) for mean in means)
             several = (
                 "" if means.size == 1 else " (on each connected part of the surface, of each component not prescribed)"
@@ -302,7 +308,10 @@ def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: 
     if not free.any():
         return None
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1).astype(np.int32)
-    return Constants(number[part, component], np.concatenate([_integrals(V) for V in layout.spaces]))
+    unknown = np.repeat(np.arange(len(layout.spaces), dtype=np.int32), [V.num_dofs for V in layout.spaces])
+    load = unknown + len(layout.spaces) * part
+    load[[] if dofs is None else dofs] = -1
+    return Constants(number[part, component], np.concatenate([_integrals(V) for V in layout.spaces]), load)
 
 
 def _vanishing(A: Any, ones: Floats, tolerance: Floats) -> Bools:

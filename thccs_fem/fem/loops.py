@@ -164,7 +164,7 @@ class _Data:
 def _values(form: Form, i: int) -> tuple[Floats, bool]:
     """Return the values of a coefficient on the cells that are integrated on; see `_Data`."""
     function = form.coefficients[i]
-    space = function.space
+    space = function.ufl_function_space()
     values = function.x.array.reshape(-1, space.block_size)
     if isinstance(space, CellwiseSpace):
         return values[space.dofs_of(form.cells)], True

@@ -8,6 +8,7 @@ import mpi4py.MPI  # noqa: F401  # initialises MPI, and loads the library of it 
 from thccs_fem.fem.petsc.eigen import EigenProblem
 from thccs_fem.fem.petsc.linear import LinearProblem
 from thccs_fem.fem.petsc.matrices import apply_lifting, assemble_matrix, assemble_vector, set_bc
+from thccs_fem.fem.petsc.multigrid import multigrid
 from thccs_fem.fem.petsc.nonlinear import NonlinearProblem
 from thccs_fem.fem.petsc.timestepping import TimeProblem
 
@@ -19,5 +20,6 @@ __all__ = [
     "apply_lifting",
     "assemble_matrix",
     "assemble_vector",
+    "multigrid",
     "set_bc",
 ]

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 import ufl
 from thccs_fem.fem.bcs import DirichletBC
-from thccs_fem.fem.eigen import EigenSystem, start_vector
+from thccs_fem.fem.eigen import EigenSystem
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import check_regular
@@ -36,7 +36,8 @@ class EigenProblem:
     and what is set in code on `solver`. If nothing is said, the eigenvalues are those nearest to a target, by the
     Krylov-Schur method with shift and invert (``st_type`` "sinvert"), factorised by MUMPS if PETSc has it, to
     ``eps_tol`` 1e-12. Where the target is an eigenvalue, as zero on a closed surface, the shift is moved a little below
-    it.
+    it. Then none is missing: they are counted, by two factorisations more; of the last one, which may be multiple, there
+    are as many copies as were asked for. With other transforms, or other ``eps_which``, nobody counts.
 
     Args:
         a: Symmetric bilinear form.
@@ -106,36 +107,34 @@ class EigenProblem:
         Raises:
             ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
                 as many eigenvalues as wanted.
-            RuntimeError: Not all converge.
+            RuntimeError: Not all converge, or some are missing.
         """
         system, solver = self._system, self._solver
         system.bcs = self.bcs
         system.assemble()
         A, M = (sharing(matrix, self._comm) for matrix in (system.A, system.M))
         with self._options.in_place():
+            solver.reset()  # the size may be another one
             solver.setOperators(A, M)
-            solver.setInitialSpace([new_vec(start_vector(system.M), self._comm)])
             solver.getST().setShift(self._shift())
-            solver.solve()
+        is_nearest = solver.getWhichEigenpairs() == SLEPc.EPS.Which.TARGET_MAGNITUDE
+        try:
+            values, vectors = system.complete(self._search, self._count if is_nearest and self._inverts() else None)
+        finally:
+            solver.setDimensions(system.num_eigenvalues)
         self._options.warn_unused()
-        values, vectors = self._converged(system.A)
         return system.accept(
             values, vectors, f"SLEPc's {solver.getType()}, after {solver.getIterationNumber()} iterations,"
         )
 
     def _shift(self) -> float:
         """Return a shift at which the shifted matrix can be factorised."""
-        system, transform = self._system, self._solver.getST()
-        pc = transform.getKSP().getPC()
-        if transform.getType() != SLEPc.ST.Type.SINVERT or not factorises(pc):
+        system, pc = self._system, self._solver.getST().getKSP().getPC()
+        if not self._inverts():
             return system.target
         shifted = system.shifted(system.target)
-        mat = sharing(shifted, self._comm)
-        trial = PETSc.PC().create(self._comm)
+        trial = self._factorisation(shifted, pc.getType(), pc.getFactorSolverType() or "petsc")
         trial.setOptionsPrefix(pc.getOptionsPrefix())
-        trial.setType(pc.getType())
-        trial.setFactorSolverType(pc.getFactorSolverType() or "petsc")
-        trial.setOperators(mat)
         try:
             trial.setUp()
             check_regular(shifted, lambda r: solved(trial.getFactorMatrix(), r))
@@ -143,9 +142,42 @@ class EigenProblem:
             return system.shift_beside()
         return system.target
 
-    def _converged(self, A: sp.csr_array) -> tuple[Floats, Floats]:
+    def _inverts(self) -> bool:
+        """Return whether shifted matrices are factorised."""
+        transform = self._solver.getST()
+        return transform.getType() == SLEPc.ST.Type.SINVERT and factorises(transform.getKSP().getPC())
+
+    def _factorisation(self, A: sp.csr_array, kind: str, solver: str) -> PETSc.PC:
+        """Return a direct solver, not set up yet."""
+        pc = PETSc.PC().create(self._comm)
+        pc.setType(kind)
+        pc.setFactorSolverType(solver)
+        pc.setOperators(sharing(A, self._comm))
+        return pc
+
+    def _count(self, number: float) -> int:
+        """Return how many eigenvalues there are below a number."""
+        solver = "mumps" if PETSc.Sys.hasExternalPackage("mumps") else "petsc"
+        pc = self._factorisation(self._system.shifted(number), "cholesky", solver)
+        if solver == "mumps":
+            pc.setFactorSetUpSolverType()
+            pc.getFactorMatrix().setMumpsIcntl(24, 1)  # looks for zero pivots, without which it does not count
+        pc.setUp()
+        return int(pc.getFactorMatrix().getInertia()[0])
+
+    def _search(self, number: int, found: Floats, start: Floats) -> tuple[Floats, Floats]:
+        """Return eigenvalues that converge, and their vectors as columns, m-orthogonal to those that were found."""
+        solver = self._solver
+        solver.setDimensions(number)
+        solver.setDeflationSpace([new_vec(vector, self._comm) for vector in found.T.copy()])
+        solver.setInitialSpace([new_vec(start, self._comm)])
+        with self._options.in_place():
+            solver.solve()
+        return self._converged()
+
+    def _converged(self) -> tuple[Floats, Floats]:
         """Return the eigenvalues that converged, and their vectors as columns."""
-        solver, n = self._solver, A.shape[0]
+        solver, n = self._solver, self._system.A.shape[0]
         count = solver.getConverged()
         vectors = np.zeros((count, n))
         values = np.array([solver.getEigenpair(i, new_vec(row, self._comm)) for i, row in enumerate(vectors)])

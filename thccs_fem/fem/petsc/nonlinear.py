@@ -163,6 +163,7 @@ class NonlinearProblem:
                 linear.choose(ksp, self.A, symmetric=False, fourth_order=is_fourth_order(system.jacobians))
             self._solver.setFromOptions()
             linear.set_fields(ksp.getPC(), system.layout)
+            linear.set_levels(ksp, system.layout.spaces)
             self._is_ready = True
         self._solver.setConvergenceHistory(reset=True)
         mats = linear.operators(self.A, system.matrix, system.constants, system.layout, ksp.getPC())

@@ -8,34 +8,28 @@ again, with equations that always hold, and is then given the states before and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, get_args
 
 from petsc4py import PETSc
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 import ufl
-from thccs_fem.fem import assembly
-from thccs_fem.fem.bcs import DirichletBC
-from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.linear import constraints, is_fourth_order
+from thccs_fem.fem.linear import is_fourth_order
 from thccs_fem.fem.nonlinear import RELATIVE
 from thccs_fem.fem.petsc import linear, nonlinear
-from thccs_fem.fem.petsc.matrices import changed, comm_of, new_mat, new_vec
+from thccs_fem.fem.petsc.evolution import Conditions, EvolutionEquations, values_of
+from thccs_fem.fem.petsc.matrices import comm_of, new_vec
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.subdivision import Ints
-from ufl.algorithms import expand_derivatives
 
 __all__ = ["TimeProblem"]
 
 Floats = npt.NDArray[np.float64]
 Scheme = Literal["implicit_euler", "bdf2", "crank_nicolson"]
-Conditions = Sequence[DirichletBC] | Callable[[FunctionSpace, float], Sequence[DirichletBC]]
 Transfer = Callable[[Function, FunctionSpace], Function]
 
 TYPES = {"implicit_euler": "beuler", "bdf2": "bdf", "crank_nicolson": "cn"}
@@ -98,7 +92,7 @@ class TimeProblem:
         if scheme not in get_args(Scheme):
             raise ValueError(f"the scheme is {scheme!r}; it must be one of {', '.join(get_args(Scheme))}")
         t = Constant(u.function_space.mesh, 0.0) if t is None else t
-        self._equations = _Equations(F, u, udot, t, bcs)
+        self._equations = EvolutionEquations(F, u, udot, t, bcs)
         if scheme == "crank_nicolson":
             self._equations.check_constant_mass()
         self._scheme: Scheme = scheme
@@ -147,17 +141,17 @@ class TimeProblem:
                 the step, which may be tried again with a smaller `dt`.
         """
         ts, x = self._ts, self._ts.getSolution()
-        if not np.array_equal(self.u.x.array, _values(x)):  # changed from outside: what was before is no history
+        if not np.array_equal(self.u.x.array, values_of(x)):  # changed from outside: what was before is no history
             self._before = None
             ts.restartStep()
         if self._before is None:
             x.array = self._equations.with_prescribed(self.u.x.array, self.time)
-        number, dt, before = self.step_number, self.dt, (self.time, _values(x).copy())
+        number, dt, before = self.step_number, self.dt, (self.time, values_of(x).copy())
         try:
             with self._options.in_place():
                 ts.step()
             reason: Any = ts.getConvergedReason()  # an int, other than the stubs say
-            if reason < 0 or not np.isfinite(_values(x)).all():
+            if reason < 0 or not np.isfinite(values_of(x)).all():
                 where = f"in the step from t = {before[0]:g} with dt = {dt:g}"
                 raise RuntimeError(f"PETSc's {ts.getType()} failed {where}: {_why(ts)}")
         except Exception as error:
@@ -168,7 +162,7 @@ class TimeProblem:
                 raise error.__cause__ from None
             raise
         self._before = before
-        self._equations.accept(self.time, _values(x))
+        self._equations.accept(self.time, values_of(x))
         ts.monitor(self.step_number, self.time, x)
         self._options.warn_unused()
         return self.u
@@ -249,16 +243,17 @@ class TimeProblem:
         ts.setMaxSteps(UNLIMITED)
         ts.setSolution(new_vec(self.u.x.array.copy(), ts.comm))
         ts.setIJacobian(self._equations.jacobian, self._equations.A)
-        if self._before is not None and self._scheme == "bdf2":
-            self._replay(ts, time, number)
-        ts.setIFunction(self._equations.residual, new_vec(np.zeros_like(self.u.x.array), ts.comm))
         snes = ts.getSNES()
         snes.setTolerances(rtol=RELATIVE)
         snes.getKSP().setTolerances(rtol=linear.TOLERANCE)
-        if not self._options.have("ksp_type", "pc_type"):
+        if not self._options.have("ksp_type", "pc_type"):  # before options are read, which leaves nothing to choose
             linear.choose(snes.getKSP(), self._equations.A, False, is_fourth_order([[self._equations.derivative]]))
+        if self._before is not None and self._scheme == "bdf2":
+            self._replay(ts, time, number)
+        ts.setIFunction(self._equations.residual, new_vec(np.zeros_like(self.u.x.array), ts.comm))
         with self._options.in_place():
             ts.setFromOptions()
+        linear.set_levels(snes.getKSP(), [self.u.function_space])
         ts.setTime(time)
         ts.setStepNumber(number)
         ts.setTimeStep(dt)
@@ -279,139 +274,10 @@ class TimeProblem:
         x.array = self.u.x.array
 
 
-class _Equations:
-    """F and its derivative at any time and state, with conditions, as callbacks of a TS.
-
-    Args:
-        F: As for `TimeProblem`.
-        u: The unknown, which takes the states that F is evaluated at.
-        udot: What takes their derivatives.
-        t: What takes the time.
-        bcs: As for `TimeProblem`.
-
-    Attributes:
-        derivative: The compiled derivative of F, with udot changing faster than u by a constant.
-        A: Its matrix, as last assembled.
-    """
-
-    def __init__(self, F: ufl.Form, u: Function, udot: Function, t: Constant, bcs: Conditions):
-        V = u.function_space
-        self._F, self._test = F, _test_function(F, u, udot)
-        self.u, self.udot, self.t, self.bcs = u, udot, t, bcs
-        self._form = form(F)
-        self._shift = Constant(V.mesh, 1.0)
-        with_degrees, trial = self._form.ufl_form, ufl.TrialFunction(V)  # the same quadrature for the derivative
-        self._mass = expand_derivatives(ufl.derivative(with_degrees, udot, trial))
-        if self._mass.empty():
-            raise ValueError(
-                "F does not contain udot: write the derivative of u with the function that is given as udot"
-            )
-        stiffness = expand_derivatives(ufl.derivative(with_degrees, u, trial))
-        self.derivative = form(stiffness + self._shift * self._mass)
-        self._values = assembly.assemble_matrix(self.derivative)
-        self._at: list[Floats] = []  # what the matrix was assembled with
-        self.A = new_mat(self._values, self.derivative.spaces)
-        self._prescribed: tuple[float, Ints, Floats] | None = None
-
-    def replaced(self, u: Function) -> tuple[ufl.Form, Function, Function]:
-        """Return the form for an unknown in another space, with the unknown and its derivative."""
-        V = u.function_space
-        udot = Function(V, self.udot.name)
-        return ufl.replace(self._F, {self.u: u, self.udot: udot, self._test: ufl.TestFunction(V)}), u, udot
-
-    def check_constant_mass(self) -> None:
-        """Raise if the terms with udot are others than a constant matrix times udot."""
-        changing = {self.u, self.udot, self.t} & {*self._mass.coefficients(), *self._mass.constants()}
-        if changing:
-            raise ValueError(
-                f"the terms with udot depend on {', '.join(sorted(map(str, changing)))}, where the trapezoidal rule is "
-                f'not of order 2: use scheme="bdf2", or divide by what stands before udot'
-            )
-
-    def with_prescribed(self, values: Floats, time: float) -> Floats:
-        """Return values of u, with those in place that are prescribed at a time."""
-        dofs, prescribed = self._conditions(time)
-        values = values.copy()
-        values[dofs] = prescribed
-        return values
-
-    def accept(self, time: float, values: Floats) -> None:
-        """Give u its values at a time."""
-        self.t.value = time
-        self.u.x.array = values
-
-    def residual(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, F: PETSc.Vec) -> None:
-        """Evaluate F; for prescribed dofs u minus what is prescribed."""
-        self._set(t, u, udot)
-        values = assembly.assemble_vector(self._form)
-        dofs, prescribed = self._conditions(t)
-        values[dofs] = self.u.x.array[dofs] - prescribed
-        F.array = values
-
-    def jacobian(
-        self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, J: PETSc.Mat, P: PETSc.Mat
-    ) -> None:
-        """Assemble the derivative where it is not what it was; udot changes `shift` times as fast as u."""
-        self._set(t, u, udot)
-        self._shift.value = shift
-        dofs, _ = self._conditions(t)
-        at = [f.x.array for f in self.derivative.coefficients] + [c.value for c in self.derivative.constants] + [dofs]
-        if len(at) != len(self._at) or not all(map(np.array_equal, at, self._at)):
-            self._at = [values.copy() for values in at]
-            assembly.assemble_matrix(self._values, self.derivative)
-            _set_rows_of_identity(self._values, dofs)
-            changed(self.A)
-
-    def forget(self) -> None:
-        """Have conditions found anew, also at a time for which they were found before."""
-        self._prescribed = None
-
-    def _set(self, t: float, u: PETSc.Vec, udot: PETSc.Vec) -> None:
-        self.accept(t, _values(u))
-        self.udot.x.array = _values(udot)
-
-    def _conditions(self, time: float) -> tuple[Ints, Floats]:
-        """Return the prescribed dofs and values at a time, which need not be found twice."""
-        if self._prescribed is None or (self._prescribed[0] != time and callable(self.bcs)):
-            self.t.value = time
-            V = self.u.function_space
-            self._prescribed = time, *constraints(self.bcs(V, time) if callable(self.bcs) else self.bcs, V)
-        return self._prescribed[1:]
-
-
-def _values(x: PETSc.Vec) -> Floats:
-    """Return the values of a vector, not to be changed."""
-    values: Any = x.array_r  # float64, which new_mat has checked
-    return values
-
-
 def _checked(dt: float) -> float:
     if not (dt > 0.0 and math.isfinite(dt)):
         raise ValueError(f"dt is {dt}: steps go forward, give a positive size")
     return dt
-
-
-def _test_function(F: ufl.Form, u: Function, udot: Function) -> ufl.Argument:
-    """Return the test function of F, where all is in one space."""
-    if not isinstance(F, ufl.Form):
-        raise TypeError(f"F is a {type(F).__name__}: give a UFL form, a sum of integrals with a test function")
-    V = u.function_space
-    if udot.function_space != V:
-        raise ValueError(f"u is in {V}, but udot in {udot.function_space}: make it with fem.Function(u.function_space)")
-    arguments = F.arguments()
-    if len(arguments) != 1 or arguments[0].ufl_function_space() != V:
-        raise ValueError(
-            f"F has the arguments {arguments}: it needs a test function in {V}, the space of u, and no other"
-        )
-    return arguments[0]
-
-
-def _set_rows_of_identity(A: sp.csr_array, dofs: Ints) -> None:
-    prescribed = np.zeros(A.shape[0], dtype=bool)
-    prescribed[dofs] = True
-    rows = np.repeat(np.arange(A.shape[0], dtype=np.int32), np.diff(A.indptr))
-    A.data[prescribed[rows]] = 0.0
-    A.data[prescribed[rows] & (rows == A.indices)] = 1.0
 
 
 def _why(ts: PETSc.TS) -> str:

@@ -11,10 +11,10 @@ import scipy.sparse.linalg as spla
 
 import ufl
 from thccs_fem.fem.bcs import DirichletBC
-from thccs_fem.fem.eigen import EigenSystem, start_vector
+from thccs_fem.fem.eigen import EigenSystem
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.scipy.linear import factorised
+from thccs_fem.fem.scipy.linear import factorised, num_negative
 
 __all__ = ["EigenProblem"]
 
@@ -25,7 +25,8 @@ class EigenProblem:
     """Find the numbers lambda and functions u with a(u, v) = lambda m(u, v) for all v, by Lanczos' method.
 
     The eigenvalues are those nearest to a target, by shift and invert. Where the target is one of them, as zero on a
-    closed surface, the shift is moved a little below it.
+    closed surface, the shift is moved a little below it. None is missing: they are counted, by two factorisations more;
+    of the last one, which may be multiple, there are as many copies as were asked for.
 
     Args:
         a: Symmetric bilinear form.
@@ -69,19 +70,26 @@ class EigenProblem:
         Raises:
             ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
                 as many eigenvalues as wanted.
-            RuntimeError: Not all converge.
+            RuntimeError: Not all converge, or some are missing.
         """
         system = self._system
         system.bcs = self.bcs
         system.assemble()
         shift, solved = self._inverse()
-        inverse = spla.LinearOperator(system.A.shape, matvec=solved, dtype=np.float64)
-        try:
-            values, vectors = spla.eigsh(
-                system.A, system.num_eigenvalues, system.M, sigma=shift, OPinv=inverse, v0=start_vector(system.M)
-            )
-        except spla.ArpackNoConvergence as error:
-            values, vectors = error.eigenvalues, error.eigenvectors
+
+        def search(number: int, found: Floats, start: Floats) -> tuple[Floats, Floats]:
+            def beside(b: Floats) -> Floats:
+                x = solved(b)
+                return x - found @ (found.T @ (system.M @ x))
+
+            inverse = spla.LinearOperator(system.A.shape, matvec=beside, dtype=np.float64)
+            try:
+                values, vectors = spla.eigsh(system.A, number, system.M, sigma=shift, OPinv=inverse, v0=beside(start))
+            except spla.ArpackNoConvergence as error:
+                values, vectors = error.eigenvalues, error.eigenvectors
+            return values, vectors
+
+        values, vectors = system.complete(search, lambda s: num_negative(system.shifted(s)))
         return system.accept(values, vectors, "ARPACK")
 
     def _inverse(self) -> tuple[float, Callable[[Floats], Floats]]:

@@ -21,7 +21,7 @@ from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import LinearSystem, check_regular, check_residual, is_symmetric
 
-__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "solve"]
+__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "num_negative", "solve"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -152,11 +152,8 @@ def factorised(A: sp.csr_array) -> Callable[[Floats], Floats]:
     Raises:
         RuntimeError: The matrix is singular, to working precision.
     """
-    transposed = sp.csc_array((A.data, A.indices, A.indptr), shape=A.shape)  # no copy
     try:
-        factors = spla.splu(
-            transposed, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options={"SymmetricMode": True}
-        )
+        factors = _factors(A, 0.01)
     except RuntimeError as error:
         raise RuntimeError(
             f"SuperLU failed ({error}): the matrix is singular. See that Dirichlet conditions fix all that the "
@@ -168,6 +165,28 @@ def factorised(A: sp.csr_array) -> Callable[[Floats], Floats]:
 
     check_regular(A, solved)
     return solved
+
+
+def num_negative(A: sp.csr_array) -> int:
+    """Return the number of negative eigenvalues of a symmetric matrix.
+
+    With pivots from the diagonal alone, the factors L U are L D L^T, and D has as many negative entries as A has negative
+    eigenvalues (Sylvester). They are right for a matrix that differs from A by rounding times the growth of the pivots.
+
+    Raises:
+        RuntimeError: There is no such factorisation.
+    """
+    factors = _factors(A, 0.0)
+    if not np.array_equal(factors.perm_r, factors.perm_c):
+        raise RuntimeError("SuperLU met a zero on the diagonal, so that eigenvalues cannot be counted: change the target")
+    return int(np.count_nonzero(factors.U.diagonal() < 0.0))
+
+
+def _factors(A: sp.csr_array, threshold: float) -> spla.SuperLU:
+    """Return the factors of the transpose, with pivots on the diagonal where they are at least so large, relatively."""
+    transposed = sp.csc_array((A.data, A.indices, A.indptr), shape=A.shape)  # no copy
+    options = {"SymmetricMode": True}
+    return spla.splu(transposed, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=threshold, options=options)
 
 
 def _direct(A: sp.csr_array, b: Floats) -> Floats:
