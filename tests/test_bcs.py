@@ -282,3 +282,17 @@ def test_conditions_are_on_spaces() -> None:
         TypeError, match=r"dirichletbc needs a space from fem\.functionspace, or V\.sub\(c\), got Function"
     ):
         fem.dirichletbc(0.0, [4, 5], fem.Function(unit_square()))  # type: ignore[arg-type]
+
+
+def test_functions_that_are_constant_on_cells_have_no_conditions() -> None:
+    D = fem.functionspace(unit_square().mesh, ("DG", 0))
+    for name, find in (
+        ("locate_dofs_geometrical", lambda V: fem.locate_dofs_geometrical(V, lambda x: x[0] < 1.0)),
+        ("boundary_dofs", fem.boundary_dofs),
+        ("region_dofs", lambda V: fem.region_dofs(V, [0])),
+        ("point_values", lambda V: fem.point_values(V, [0], [[0.5, 0.5]])),
+    ):
+        with pytest.raises(TypeError, match=rf"{name} needs a space .* got CellwiseSpace\(values \(\), 16 cells of a"):
+            find(D)
+    with pytest.raises(TypeError, match="dirichletbc needs a space from"):
+        fem.dirichletbc(1.0, [0], D)  # type: ignore[arg-type]  # what is refused

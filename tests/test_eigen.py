@@ -299,6 +299,10 @@ def test_numbers_and_conditions_that_are_refused(make: Maker) -> None:
     V = rectangle(3)
     with pytest.raises(ValueError, match="num_eigenvalues is 0"):
         make(laplace(V), num_eigenvalues=0)
+    with pytest.raises(ValueError, match=r"num_eigenvalues is 2\.5: ask for one or more, a whole number"):
+        make(laplace(V), num_eigenvalues=2.5)
+    with pytest.raises(ValueError, match="target is nan"):
+        make(laplace(V), target=float("nan"))
     with pytest.raises(ValueError, match="36 eigenvalues are wanted of 36 dofs"):
         make(laplace(V), num_eigenvalues=36).solve()
     with pytest.raises(ValueError, match=r"conditions prescribe values up to 2: .* prescribe 0\.0"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ufl
-from thccs_fem import element, jit
+from thccs_fem import element, fem, generators, jit
 
 ROOT = Path(__file__).parents[1]
 
@@ -76,6 +76,24 @@ def test_what_a_killed_process_left_is_no_obstacle(filled_cache: Path, tmp_path:
         (tmp_path / fingerprint.name / "build-killed" / name).mkdir(parents=True)
         (tmp_path / fingerprint.name / name).with_suffix(".lock").touch()
     assert output(COMPILE, THCCS_CACHE=tmp_path) == (0, "")
+
+
+def test_forms_with_constants_are_compiled_once_whatever_their_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # UFL sorts factors by their text, where 10 comes before 9.
+    monkeypatch.setenv("THCCS_CACHE", str(tmp_path))
+    msh = generators.rectangle((1, 1), (0.0, 0.0), (2.0, 3.0))
+
+    def integrate() -> None:
+        a, b, c = (fem.Constant(msh, value) for value in (2.0, 3.0, 5.0))
+        assert fem.assemble_scalar(fem.form((a * b + c**2) * ufl.dx)) == pytest.approx(6.0 * (6.0 + 25.0))
+
+    integrate()
+    while str(fem.Constant(msh, 0.0).count() + 1).strip("9"):
+        pass  # until the next ones are 9 and 10, or 99 and 100
+    integrate()
+    assert [name.split("_")[0] for name in modules(tmp_path)].count("forms") == 1
 
 
 def test_without_locks_the_first_one_wins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,8 +1,13 @@
 """Matrices, vectors and linear problems of PETSc, against those of SciPy and closed forms."""
 
 import gc
+import os
+import subprocess
+import sys
+import textwrap
 import weakref
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -249,6 +254,27 @@ def test_closed_surfaces(mesh: str, name: str) -> None:
     assert problem.A.getNullSpace().test(problem.A)
 
 
+def test_a_null_space_from_outside_stays() -> None:
+    # A sheet that nothing holds may turn as well, which is no constant.
+    V = square((2,))
+    u, v, x = arguments(V)
+    motions = [fem.project(as_vector(motion), V) for motion in ([1.0, 0.0], [0.0, 1.0], [-x[1], x[0]])]
+    basis = np.linalg.qr(np.stack([motion.x.array for motion in motions], axis=1))[0]
+    a, stretch = inner(sym(grad(u)), sym(grad(v))) * dx, fem.Constant(V.mesh, 2.0)
+    L = stretch * div(v) * dx  # so that u = stretch x, but for rigid motions
+    problem = LinearProblem(a, L, petsc_options_prefix="free_", petsc_options={"ksp_type": "cg", "pc_type": "none"})
+    own = PETSc.NullSpace().create(
+        vectors=[PETSc.Vec().createWithArray(b, comm=PETSc.COMM_SELF) for b in basis.T.copy()]
+    )
+    problem.A.setNullSpace(own)
+    for value in (2.0, 3.0):
+        stretch.value = value
+        solution = problem.solve()
+        assert problem.A.getNullSpace().handle == own.handle
+        miss = solution.x.array - value * fem.project(x, V).x.array
+        np.testing.assert_allclose(miss - basis @ (basis.T @ miss), 0.0, atol=1e-8)
+
+
 def test_communicators_are_those_of_the_mesh() -> None:
     if MPI.COMM_WORLD.size > 1:
         pytest.skip("spaces are serial")
@@ -487,6 +513,32 @@ def test_memory_is_given_back() -> None:
     assert matrix() is None
     assert system() is None
     np.testing.assert_allclose(solution.x.array, 2.0, rtol=1e-10)
+
+
+PROBLEMS = """
+    from thccs_fem.fem.petsc import EigenProblem, LinearProblem, NonlinearProblem, TimeProblem
+
+    import ufl
+    from thccs_fem import fem, generators
+
+    V = fem.functionspace(generators.torus((6, 5)), ("THCCS", 3))
+    w, v, u, udot = ufl.TrialFunction(V), ufl.TestFunction(V), fem.Function(V), fem.Function(V)
+    linear = LinearProblem(w * v * ufl.dx, v * ufl.dx, petsc_options_prefix="fresh_")
+    nonlinear = NonlinearProblem((u + u**3 - 2.0) * v * ufl.dx, u, petsc_options_prefix="fresh_")
+    eigen = EigenProblem(w * v * ufl.dx, num_eigenvalues=2, petsc_options_prefix="fresh_")
+    time = TimeProblem((udot + u) * v * ufl.dx, u, udot, dt=0.1, petsc_options_prefix="fresh_")
+    for problem in (linear, nonlinear, eigen):
+        problem.solve()
+    time.step()
+"""
+
+
+def test_nothing_is_imported_before_and_nothing_left_behind_in_a_process_of_its_own() -> None:
+    # Problems that live as long as the process: what PETSc owns then, Python reports as leaked.
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    command = [sys.executable, "-c", textwrap.dedent(PROBLEMS)]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
 
 
 # ---- What fails

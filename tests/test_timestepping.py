@@ -444,6 +444,13 @@ def test_a_step_without_a_solution_may_be_tried_again() -> None:
     assert problem.step_number == 2
 
 
+def test_a_last_step_that_fails_leaves_the_size_of_steps() -> None:
+    problem = explosion(dt=1.0)
+    with pytest.raises(RuntimeError, match=r"from t = 0 with dt = 0\.5"):
+        problem.solve(0.5)
+    assert (problem.time, problem.dt) == (0.0, 1.0)
+
+
 def test_data_may_be_others_when_a_step_is_tried_again() -> None:
     V = square()
     u, udot, v = functions(V)
@@ -519,10 +526,9 @@ def test_memory_is_given_back() -> None:
     problem.step()
     equations, ts = weakref.ref(problem._equations), problem.solver
     del problem
-    ts.destroy()
-    del ts
     gc.collect()
     assert equations() is None
+    assert ts.getStepNumber() == 1  # who holds the TS may ask it, though it cannot go on
 
 
 # ---- What is refused

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 
 import ufl
 from thccs_fem import element
+from thccs_fem.absent import Absent
 from thccs_fem.polygons import (
     Bools,
     Faces,
@@ -164,6 +165,11 @@ class ControlMesh:
         if self.gdim == 2:
             self._check_counter_clockwise(face_areas(points[polygons.vertices], polygons)[:, 0])
         self._warn_of_cracks()
+
+    geometry = Absent(
+        "msh.vertices are the control points, msh.gdim their dimension; limit.evaluate has points of the surface"
+    )
+    topology = Absent("msh.quads, msh.edges and msh.edge_faces say what is next to what; surfaces are of dimension 2")
 
     def __repr__(self) -> str:
         names = ("gdim", "num_vertices", "num_edges", "num_faces")

@@ -123,9 +123,11 @@ def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
 
 
 def _check_rank(form: Form, rank: int) -> None:
+    if not isinstance(form, Form):
+        raise TypeError(f"a compiled form is needed, fem.form(...), got {type(form).__module__}.{type(form).__name__}")
     if form.rank != rank:
         what = ("a scalar has no arguments", "a vector has a test function", "a matrix has a test and a trial function")
-        raise ValueError(f"the form of {what[rank]}, but this one has {form.rank} arguments: {form.spaces}")
+        raise ValueError(f"the form of {what[rank]}, but the number of arguments here is {form.rank}")
 
 
 def _new_matrix(form: Form) -> sp.csr_array:

@@ -17,8 +17,8 @@ import ufl
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.expression import ValueOrExpression
 from thccs_fem.fem.fitting import fitted, side_rows
-from thccs_fem.fem.function import Constant
-from thccs_fem.fem.space import Component, FunctionSpace
+from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.space import Component, FunctionSpace, check_space
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["DirichletBC", "boundary_dofs", "dirichletbc", "locate_dofs_geometrical", "region_dofs"]
@@ -52,17 +52,22 @@ def locate_dofs_geometrical(V: FunctionSpace, marker: Marker) -> Ints:
 
     Returns:
         Function numbers, ascending, shape (m,), local.
+
+    Raises:
+        TypeError: If V is no space of splines.
+        ValueError: If the marker returns another shape.
     """
+    check_space(V, "locate_dofs_geometrical")
     return np.flatnonzero(_marked(marker, V.reference_points)).astype(np.int32)
 
 
 def boundary_dofs(
-    V: FunctionSpace, marker: Marker | None = None, *, tag: int | None = None, slope: bool = False
+    V: FunctionSpace | Component, marker: Marker | None = None, *, tag: int | None = None, slope: bool = False
 ) -> Ints:
     """Return the functions that do not vanish on the boundary or on a part of it.
 
     Args:
-        V: The space.
+        V: The space, or one component of it, which makes no difference.
         marker: Takes points x of shape (3, n), returns booleans; an edge counts where its two ends and its middle are
             marked.
         tag: Edge tag of the control mesh; only its boundary edges.
@@ -72,10 +77,13 @@ def boundary_dofs(
         Function numbers, ascending, shape (m,), local.
 
     Raises:
-        ValueError: If both a marker and a tag are given.
+        TypeError: If V is no space of splines.
+        ValueError: If both a marker and a tag are given, or the marker returns another shape.
     """
+    check_space(V, "boundary_dofs")
     if marker is not None and tag is not None:
         raise ValueError("give a marker or a tag, not both")
+    V = V.space if isinstance(V, Component) else V
     cells = V.cells
     piece, side, edge = cells.boundary_pieces
     chosen = np.ones(piece.size, dtype=bool)
@@ -103,9 +111,10 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
         Function numbers, ascending, shape (m,), local.
 
     Raises:
-        TypeError: If the faces are no integers.
+        TypeError: If the faces are no integers, or V is no space of splines.
         ValueError: If not just one of `faces` and `tag` is given, or a face is out of range.
     """
+    check_space(V, "region_dofs")
     if (faces is None) == (tag is None):
         raise ValueError("give the faces of the region, or their tag")
     marked = np.zeros(V.mesh.num_faces, dtype=bool)
@@ -120,7 +129,11 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
 
 
 def dirichletbc(
-    value: ValueOrExpression, dofs: npt.ArrayLike, V: FunctionSpace | Component, *, slope: bool = False
+    value: ValueOrExpression,
+    dofs: npt.ArrayLike,
+    V: FunctionSpace | Component | None = None,
+    *,
+    slope: bool = False,
 ) -> DirichletBC:
     """Prescribe a value on functions.
 
@@ -129,7 +142,7 @@ def dirichletbc(
             UFL expression, or a callable g(x) with x of shape (3, n). Expressions and callables are projected in L2.
             All are read here and now.
         dofs: Function numbers, shape (n,).
-        V: The space, or one component `V.sub(c)`.
+        V: The space, or one component `V.sub(c)`; None: that of the value, a `Function`.
         slope: Fit value and slope of a UFL expression on the boundary, for dofs of ``boundary_dofs(V, slope=True)``.
             It must be differentiable there. Numbers need no such thing: 0 on these dofs is value and slope 0.
 
@@ -138,6 +151,8 @@ def dirichletbc(
         ValueError: If the dofs are out of range, the value's shape does not fit, a value is not finite, or the slope is
             wanted for dofs that have neither value nor slope on the boundary.
     """
+    if V is None and isinstance(value, Function):
+        V = value.function_space
     space, component = (V.space, V.component) if isinstance(V, Component) else (V, None)
     if not isinstance(space, FunctionSpace):
         raise TypeError(f"dirichletbc needs a space from fem.functionspace, or V.sub(c), got {type(V).__name__}")

@@ -14,6 +14,9 @@ __all__ = ["MEASURES", "check_metadata", "check_no_facets", "checked_mesh"]
 #: What is integrated over, in FFCx's order, and its measure.
 MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
+EDGE_TAGS = "edge_tags={(i, j): tag}"
+_ARGUMENTS = {"cell": "face_tags=tags", "exterior_facet": EDGE_TAGS, "interior_facet": EDGE_TAGS}
+
 # FFCx knows them on affine cells only.
 SIZES = (
     ufl.classes.CellVolume,
@@ -105,9 +108,8 @@ def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
             f"from Function.eval and fem.point_values."
         )
     if integral.subdomain_data() is not None:
-        tags = "face_tags=tags" if kind == "cell" else "edge_tags={(i, j): tag}"
         raise ValueError(
-            f"the measure has subdomain_data; tags belong to the mesh here: ControlMesh(..., {tags}) and "
+            f"the measure has subdomain_data; tags belong to the mesh here: ControlMesh(..., {_ARGUMENTS[kind]}) and "
             f"{MEASURES[kind]}(tag)"
         )
     known = _known_tags(mesh, kind)
@@ -116,7 +118,7 @@ def _check_integral(integral: ufl.Integral, mesh: ControlMesh) -> None:
             of_what = {"cell": "the mesh", "exterior_facet": "edges on its boundary"}.get(kind, "edges inside it")
             raise ValueError(
                 f"the form has {MEASURES[kind]}({tag!r}), but tags are from 0, and those of {of_what} are "
-                f"{sorted(known)}"
+                f"{sorted(known)}; they are given to the mesh: ControlMesh(..., {_ARGUMENTS[kind]})"
             )
     for node in unique_pre_traversal(integral.integrand()):
         if isinstance(node, SIZES):

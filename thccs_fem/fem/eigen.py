@@ -72,12 +72,12 @@ class EigenSystem:
         self.m = form(mass if m is None else m)
         if self.m.spaces != self.a.spaces:
             raise ValueError(f"m has arguments in {[str(V) for V in self.m.spaces]}, but those of a are in {V}")
-        if not isinstance(num_eigenvalues, int | np.integer) or num_eigenvalues < 1:
+        if num_eigenvalues < 1 or num_eigenvalues != int(num_eigenvalues):
             raise ValueError(f"num_eigenvalues is {num_eigenvalues}: ask for one or more, a whole number")
         if not np.isfinite(target):
             raise ValueError(f"target is {target}: give the number that the eigenvalues are to be nearest to")
         self.bcs = bcs
-        self.num_eigenvalues = num_eigenvalues
+        self.num_eigenvalues = int(num_eigenvalues)
         self.target = target
         self.free: Ints = np.zeros(0, dtype=np.int32)
         self.A = self.M = sp.csr_array((0, 0))

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
+from thccs_fem.absent import Absent
 from thccs_fem.element import NUM_FUNCTIONS
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, cellwise
@@ -32,6 +33,11 @@ class Vector:
     @array.setter
     def array(self, values: npt.ArrayLike) -> None:
         self._array[:] = values
+
+    petsc_vec = Absent("PETSc.Vec().createWithArray(u.x.array) is one that shares the values")
+
+    def scatter_forward(self) -> None:
+        """Update the ghosts, of which there are none in serial: nothing happens."""
 
 
 class Function(ufl.Coefficient):
@@ -120,6 +126,19 @@ class Function(ufl.Coefficient):
 
     def __str__(self) -> str:
         return self.name
+
+    interpolate = Absent("splines have no nodal values; fem.project(value, V) returns the nearest function")
+    sub = Absent("u[i] is a component in forms, u.x.array[i :: V.block_size] are its coefficients")
+    split = Absent(
+        "there are no mixed elements; u[i] is a component in forms, and several unknowns are several Functions"
+    )
+
+    def __float__(self) -> float:
+        raise ValueError(f"the function {self} is no number: u.eval(faces, uv) has its values at points")
+
+    def ufl_evaluate(self, x: object, component: object, derivatives: object) -> float:
+        """Refuse what UFL makes of u(x), for which the face of a point in space is not known."""
+        raise TypeError(f"{self}({x}): functions have values at points of faces, u.eval(faces, uv)")
 
 
 def cell_sizes(V: FunctionSpace) -> Function:

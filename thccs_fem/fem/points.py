@@ -7,7 +7,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from thccs_fem import element
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.space import FunctionSpace, check_space
 
 __all__ = ["point_values"]
 
@@ -31,9 +31,10 @@ def point_values(
         Shape (n, V.num_functions); 16 entries a row in regular cells of level 0.
 
     Raises:
-        TypeError: If faces or corners are no integers.
+        TypeError: If faces or corners are no integers, or V is no space of splines.
         ValueError: If a face, coordinate or corner is out of range.
     """
+    check_space(V, "point_values")
     piece, position = V.cells.locate(faces, uv, corner)
     splines = element.bspline_values(position)
     local = (splines[:, 1, :, None] * splines[:, 0, None, :]).ravel()  # function i + 4 j is B_i(u) B_j(v)

@@ -17,6 +17,7 @@ import scipy.sparse as sp
 
 import ufl
 from thccs_fem import element
+from thccs_fem.absent import Absent
 from thccs_fem.bezier import bezier_masks
 from thccs_fem.boundary import BoundaryRule, to_dofs
 from thccs_fem.extraction import Cells, extract
@@ -25,7 +26,7 @@ from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.subdivision import Ints
 
-__all__ = ["CellwiseSpace", "Component", "FunctionSpace", "cellwise", "functionspace"]
+__all__ = ["CellwiseSpace", "Component", "FunctionSpace", "cellwise", "check_space", "functionspace"]
 
 FAMILY, DEGREE = "THCCS", 3
 
@@ -51,12 +52,19 @@ class FunctionSpace(ufl.FunctionSpace):
         value_shape: tuple[int, ...] = (),
         integration: Callable[[Hierarchy], Cells] = extract,
     ):
+        if not isinstance(hierarchy, Hierarchy):
+            given = type(hierarchy).__name__
+            raise TypeError(f'FunctionSpace needs a Hierarchy, got {given}: use functionspace(msh, ("THCCS", 3))')
         super().__init__(  # type: ignore[no-untyped-call]  # UFL is typed in part
             hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline()
         )
         self.hierarchy = hierarchy
         self.integration = integration
         self.block_size = int(np.prod(value_shape, dtype=int))
+
+    dofmap = Absent("V.cells.batches have the dofs of cells; their number is V.num_dofs, the block size V.block_size")
+    tabulate_dof_coordinates = Absent("coefficients belong to no points; V.reference_points has one near each function")
+    element = Absent("fem.project takes the place of interpolation; an Expression has points of the unit square")
 
     @property
     def mesh(self) -> ControlMesh:
@@ -280,12 +288,29 @@ def cellwise(V: FunctionSpace, value_shape: tuple[int, ...] = ()) -> CellwiseSpa
     return CellwiseSpace(V.mesh, V.hierarchy, _checked_shape(value_shape))
 
 
+def check_space(V: object, what: str) -> None:
+    """Raise if something is no space of splines.
+
+    Args:
+        V: What was given.
+        what: What needs a space, for the message.
+
+    Raises:
+        TypeError: It is none.
+    """
+    if not isinstance(V, FunctionSpace):
+        given = str(V) if isinstance(V, CellwiseSpace) else type(V).__name__
+        raise TypeError(f'{what} needs a space from fem.functionspace(msh, ("THCCS", 3)), got {given}')
+
+
 class Component:
     """One component of a vector-valued space; made by `FunctionSpace.sub`."""
 
     def __init__(self, space: FunctionSpace, component: int):
         self.space = space
         self.component = component
+
+    collapse = Absent("dofs are numbers of functions, the same for all components: fem.boundary_dofs(V) finds them")
 
 
 @overload

@@ -234,9 +234,14 @@ def set_levels(solver: PETSc.KSP, spaces: Sequence[FunctionSpace]) -> None:
 def operators(
     A: PETSc.Mat, matrix: BlockMatrix, constants: Constants | None, layout: Layout, pc: PETSc.PC
 ) -> tuple[PETSc.Mat, PETSc.Mat]:
-    """Return the matrix, and a regular one like it to be factorised where constants are in its kernel."""
-    A.setNullSpace(null_space(constants, A.comm))
-    A.setTransposeNullSpace(null_space(constants, A.comm))
+    """Return the matrix, and a regular one like it to be factorised where constants are in its kernel.
+
+    A null space that was set from outside, as that of rigid motions, stays.
+    """
+    if A.getAttr("constants") is not None or not A.getNullSpace().handle:
+        A.setNullSpace(null_space(constants, A.comm))
+        A.setTransposeNullSpace(null_space(constants, A.comm))
+        A.setAttr("constants", constants)
     if constants is None or not factorises(pc):
         return A, A
     return A, new_block_mat(constants.pinned(matrix.whole), layout)

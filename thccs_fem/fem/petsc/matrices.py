@@ -73,13 +73,22 @@ def _(A: PETSc.Mat, form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
     return A
 
 
-def assemble_vector(form: Form, /) -> PETSc.Vec:
-    """Assemble the vector of a form with a test function.
+def assemble_vector(form: Form | PETSc.Vec, added: Form | None = None, /) -> PETSc.Vec:
+    """Return the vector of a form, ``assemble_vector(L)``, or add it to one, ``assemble_vector(b, L)``.
+
+    Args:
+        form: Compiled form with a test function; or the vector that is added to.
+        added: The form, if the vector came first.
 
     Raises:
+        TypeError: The form is no compiled form.
         ValueError: The form has not one argument.
     """
-    return new_vec(assembly.assemble_vector(form), comm_of(form.spaces[0]))
+    if isinstance(form, PETSc.Vec):
+        form.array_w[:] += assembly.assemble_vector(added)  # type: ignore[arg-type]  # it says what else is given
+        return form
+    values = assembly.assemble_vector(form)
+    return new_vec(values, comm_of(form.spaces[0]))
 
 
 def apply_lifting(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import Any, Literal
+from weakref import proxy
 
 from petsc4py import PETSc
 
@@ -167,8 +168,8 @@ class NonlinearProblem:
             self._is_ready = True
         self._solver.setConvergenceHistory(reset=True)
         mats = linear.operators(self.A, system.matrix, system.constants, system.layout, ksp.getPC())
-        self._solver.setFunction(partial(_residual, system), self.b)
-        self._solver.setJacobian(partial(_jacobian, system), *mats)
+        self._solver.setFunction(partial(_residual, proxy(system)), self.b)
+        self._solver.setJacobian(partial(_jacobian, proxy(system)), *mats)
 
     def _check(self, x: Floats) -> None:
         """Raise if there is no solution."""
@@ -208,7 +209,8 @@ class NonlinearProblem:
         return ""
 
 
-# Functions, not methods: a SNES that knew its problem would never be freed.
+# A SNES must not own its problem, which would then never be freed; nor forms, which Python, when it ends, cannot take
+# back from PETSc any more.
 
 
 def _residual(system: NonlinearSystem, _: PETSc.SNES, x: PETSc.Vec, b: PETSc.Vec) -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, Literal, get_args
+from weakref import proxy
 
 from petsc4py import PETSc
 
@@ -178,9 +180,11 @@ class TimeProblem:
             is_shorter = left < (1.0 - SAME_TIME) * dt  # else the matrix would be another one for a rounding error
             if is_shorter:
                 self.dt = left
-            self.step()
-            if is_shorter:
-                self.dt = dt
+            try:
+                self.step()
+            finally:
+                if is_shorter:
+                    self.dt = dt
             yield self.u
 
     def solve(self, until: float) -> Function:
@@ -242,7 +246,8 @@ class TimeProblem:
         ts.setErrorIfStepFails(False)
         ts.setMaxSteps(UNLIMITED)
         ts.setSolution(new_vec(self.u.x.array.copy(), ts.comm))
-        ts.setIJacobian(self._equations.jacobian, self._equations.A)
+        equations = proxy(self._equations)  # which a TS must not own: when Python ends, it cannot take them back
+        ts.setIJacobian(partial(EvolutionEquations.jacobian, equations), self._equations.A)
         snes = ts.getSNES()
         snes.setTolerances(rtol=RELATIVE)
         snes.getKSP().setTolerances(rtol=linear.TOLERANCE)
@@ -250,7 +255,9 @@ class TimeProblem:
             linear.choose(snes.getKSP(), self._equations.A, False, is_fourth_order([[self._equations.derivative]]))
         if self._before is not None and self._scheme == "bdf2":
             self._replay(ts, time, number)
-        ts.setIFunction(self._equations.residual, new_vec(np.zeros_like(self.u.x.array), ts.comm))
+        ts.setIFunction(
+            partial(EvolutionEquations.residual, equations), new_vec(np.zeros_like(self.u.x.array), ts.comm)
+        )
         with self._options.in_place():
             ts.setFromOptions()
         linear.set_levels(snes.getKSP(), [self.u.function_space])
