@@ -12,8 +12,8 @@
 # eikonal equation $|\nabla_\Gamma \varphi| = 1$, which is nonlinear and has kinks. Crane, Weischedel and Wardetzky
 # (Geodesics in heat, ACM Transactions on Graphics 32, 2013) found a way around it with *two linear problems*:
 #
-# 1. Keep the point hot for a short time $t$, and see how far the heat comes:
-#    $\; w - t \Delta_\Gamma w = 0$, $w = 1$ at the point.
+# 1. Keep the point hot for a short time $t$, and see how far the heat comes. One implicit step will do:
+#    $\; w / t - \Delta_\Gamma w = 0$, $w = 1$ at the point.
 # 2. Heat has hardly arrived anywhere far away. But what has come came by the shortest way: $-\nabla_\Gamma w$ points
 #    away from the source. Only its length is of no use, so take $X = -\nabla_\Gamma w / |\nabla_\Gamma w|$.
 # 3. Find the function whose gradient is nearest to $X$: $\; \Delta_\Gamma \varphi = \operatorname{div}_\Gamma X$.
@@ -33,7 +33,7 @@ from matplotlib.colors import ListedColormap
 
 import ufl
 from thccs_fem import adapt, fem, generators, limit, plot
-from thccs_fem.forms import laplace_beltrami, poisson
+from thccs_fem.forms import heat, laplace_beltrami
 
 try:
     from mpi4py import MPI  # noqa: F401  # petsc4py wants it loaded
@@ -70,6 +70,9 @@ def at_source(V: fem.FunctionSpace, face: int, uv: tuple[float, float]) -> np.nd
 # %% [markdown]
 # ## The two problems
 #
+# `heat.F` is the residual of the heat equation, in $u$ and its derivative $\dot u$. For this we put the difference
+# quotient of one step, and `ufl.system` takes it apart into a bilinear form and a load.
+#
 # The time is $t = 16 h^2$ with $h^2$ the mean area of the faces. Heat falls off like $e^{-r / \sqrt t}$: at a distance
 # of $36 \sqrt t$ it is less than a rounding error at the source, and $X$ is noise. So the time must not be too short;
 # the longer it is, the more of the heat comes by other ways than the shortest. The second problem is pure Neumann:
@@ -83,8 +86,9 @@ def geodesic_distance(V: fem.FunctionSpace, face: int, uv: tuple[float, float]) 
     area = fem.assemble_scalar(fem.form(fem.Constant(msh, 1.0) * ufl.dx))
     t = fem.Constant(msh, 16 * area / msh.num_faces)
     hot = fem.dirichletbc(1.0, at_source(V, face, uv), V)
-    nothing = poisson.L(fem.Constant(msh, 0.0), v)
-    w = LinearProblem(poisson.a(u, v, kappa=t, c=1), nothing, bcs=[hot], petsc_options_prefix="heat_").solve()
+    cold = fem.Constant(msh, 0.0)
+    step = ufl.system(heat.F(u, (u - cold) / t, v))
+    w = LinearProblem(*step, bcs=[hot], petsc_options_prefix="heat_").solve()
     length = ufl.sqrt(ufl.inner(ufl.grad(w), ufl.grad(w)))
     X = ufl.conditional(ufl.gt(length, 0), -ufl.grad(w) / length, 0 * ufl.grad(w))
     load = ufl.inner(X, ufl.grad(v)) * ufl.dx

@@ -135,7 +135,7 @@ def corners_at(msh: ControlMesh, points: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def pinched_hemisphere(n: int) -> tuple[fem.Function, float]:
     msh = generators.interpolated(generators.hemisphere(n, R=10.0))
-    V = fem.functionspace(msh, ("THCCS", 3, (3,)))
+    V = fem.functionspace(msh, ("THCCS", 3, (3,)), cap_level=6)
     points = corners_at(msh, 10.0 * directions)
     values = fem.point_values(V, *points)
     uh = solve(V, HEMISPHERE, (values.T @ forces).ravel(), six_conditions(V))

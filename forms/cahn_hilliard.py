@@ -21,6 +21,8 @@ import ufl
 from ufl.core.expr import Expr
 from ufl.domain import extract_unique_domain
 
+GAMMA = 20.0  # penalty of the slope on the boundary, that of a clamped plate: plate.SLOPE * plate.GAMMA
+
 
 def energy(u: Expr, epsilon: Expr | float) -> ufl.Form:
     """Return the integral of epsilon^2 |grad(u)|^2 / 2 + W(u).
@@ -60,7 +62,13 @@ def F(u: Expr, udot: Expr, v: Expr, epsilon: Expr | float, M: Expr | float = 1) 
 
 
 def contact(
-    u: Expr, v: Expr, epsilon: Expr | float, h: Expr | float, M: Expr | float = 1, gamma: float = 20.0
+    u: Expr,
+    v: Expr,
+    epsilon: Expr | float,
+    h: Expr | float,
+    M: Expr | float = 1,
+    gamma: float = GAMMA,
+    ds: ufl.Measure = ufl.ds,
 ) -> ufl.Form:
     """Return what is added to F for grad(u) . n = 0 on the boundary: Nitsche's method.
 
@@ -73,6 +81,7 @@ def contact(
         h: Size of the cells.
         M: Mobility.
         gamma: Penalty.
+        ds: Where the condition holds, as ``ufl.ds(tag)``.
     """
     n = ufl.FacetNormal(extract_unique_domain(v))
 
@@ -80,4 +89,4 @@ def contact(
         return ufl.inner(ufl.grad(w), n)
 
     consistent = -ufl.div(ufl.grad(u)) * slope(v) - ufl.div(ufl.grad(v)) * slope(u)
-    return epsilon**2 * M * (consistent + gamma * slope(u) * slope(v) / h) * ufl.ds
+    return epsilon**2 * M * (consistent + gamma * slope(u) * slope(v) / h) * ds

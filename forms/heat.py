@@ -15,7 +15,15 @@ import ufl
 from ufl.core.expr import Expr
 
 
-def F(u: Expr, udot: Expr, v: Expr, f: Expr | float = 0, g: Expr | None = None, kappa: Expr | float = 1) -> ufl.Form:
+def F(
+    u: Expr,
+    udot: Expr,
+    v: Expr,
+    f: Expr | float = 0,
+    g: Expr | None = None,
+    kappa: Expr | float = 1,
+    ds: ufl.Measure = ufl.ds,
+) -> ufl.Form:
     """Return the form that is zero for all v: the integral of udot v + kappa grad(u) . grad(v) - f v, and of -g v.
 
     Args:
@@ -25,9 +33,10 @@ def F(u: Expr, udot: Expr, v: Expr, f: Expr | float = 0, g: Expr | None = None, 
         f: Source.
         g: Inward flux on the boundary; None for none.
         kappa: Diffusivity: a scalar, or a tensor that acts on gradients.
+        ds: Where the flux is, as ``ufl.ds(tag)``.
     """
     inside = udot * v * ufl.dx + (ufl.inner(kappa * ufl.grad(u), ufl.grad(v)) - f * v) * ufl.dx
-    return inside if g is None else inside - g * v * ufl.ds
+    return inside if g is None else inside - g * v * ds
 
 
 def strong_residual(u: Expr, udot: Expr, f: Expr | float = 0, kappa: Expr | float = 1) -> Expr:

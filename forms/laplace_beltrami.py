@@ -4,8 +4,8 @@ Strong form, with the tangential gradient and divergence of the surface:
 
     -div(kappa grad(u)) = f
 
-and no flux through the rim, if there is one and nothing else is said there. On a closed surface f
-must have mean zero, and u is known up to a constant: fix it by a Dirichlet condition.
+and, on a rim, kappa grad(u) . n = g with the conormal n, where no Dirichlet condition is set. On a closed surface f
+must have mean zero, and u is known up to a constant: it is that with mean zero, or fixed by a Dirichlet condition.
 
 UFL's ``grad`` and ``div`` on a surface in space are the tangential ones, so nothing here speaks of
 the surface. Source: Dziuk and Elliott, Finite element methods for surface PDEs, Acta Numerica 22
@@ -32,14 +32,17 @@ def a(u: Expr, v: Expr, kappa: Expr | float = 1) -> ufl.Form:
     return ufl.inner(kappa * ufl.grad(u), ufl.grad(v)) * ufl.dx
 
 
-def L(f: Expr, v: Expr) -> ufl.Form:
-    """Return the load, the integral of f v.
+def L(f: Expr, v: Expr, g: Expr | None = None, ds: ufl.Measure = ufl.ds) -> ufl.Form:
+    """Return the load, the integral of f v, plus that of g v over the rim.
 
     Args:
         f: Source.
         v: Test function.
+        g: Inward flux through the rim; None for none.
+        ds: Where that is, as ``ufl.ds(tag)``.
     """
-    return ufl.inner(f, v) * ufl.dx
+    load = ufl.inner(f, v) * ufl.dx
+    return load if g is None else load + ufl.inner(g, v) * ds
 
 
 def nitsche(

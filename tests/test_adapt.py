@@ -448,3 +448,15 @@ def test_progress_is_shown_on_demand(progress: bool | None, shown: bool, capfd: 
     assert out == ""
     assert ("adaptive run" in err) == shown
     assert ("2/2" in err) == shown
+
+
+def test_functions_that_are_constant_on_cells_are_not_refined() -> None:
+    V = fem.functionspace(generators.torus((5, 4)), ("THCCS", 3))
+    D = fem.cellwise(V)
+    for what, call in (
+        ("refinement", lambda: adapt.refine(D, [0])),  # type: ignore[arg-type]  # what is refused
+        ("coarsening", lambda: adapt.coarsen(D, [0])),  # type: ignore[arg-type]
+        ("transfer", lambda: adapt.transfer(fem.Function(D), V)),
+    ):
+        with pytest.raises(TypeError, match=rf"{what} needs a space from .*, got CellwiseSpace"):
+            call()

@@ -124,6 +124,14 @@ def test_no_copy_is_missing_on_either_side_of_a_target(make: Maker) -> None:
     np.testing.assert_allclose(values, 5 * [6.0] + 7 * [12.0], rtol=1e-3)
 
 
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6])
+def test_eigenvalues_that_are_wanted_roughly_are_counted_roughly(tolerance: float) -> None:
+    V = fem.functionspace(generators.interpolated(generators.cube_sphere(8)), ("THCCS", 3))
+    options = {"eps_tol": tolerance, "eps_ncv": 11}  # with a subspace as small as that they are no better than wanted
+    values, _ = slepc_problem(laplace(V), num_eigenvalues=9, petsc_options=options).solve()
+    np.testing.assert_allclose(values, [0.0] + 3 * [2.0] + 5 * [6.0], rtol=1e-3 + tolerance, atol=1e-3)
+
+
 def test_searches_go_on_until_the_count_is_right() -> None:
     V = rectangle(4)
     system = EigenSystem(laplace(V), bcs=fixed(V), num_eigenvalues=4)

@@ -63,7 +63,7 @@ def on_sides(facets: Facets, u: Floats, t: Floats) -> tuple[list[Floats], list[F
 # ---- Where they are
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(case=st.sampled_from(CASES), steps=STEPS)
 def test_both_sides_of_random_refinements_see_the_same_points_and_values(
     case: tuple[str, str], steps: list[list[tuple[str, bool, int]]]

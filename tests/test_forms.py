@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -306,3 +307,46 @@ def test_edges_of_cells_for_dx_alone_are_refused() -> None:
     with pytest.raises(ValueError, match="integrals over dS and ds, but its spaces come from with_integration"):
         fem.form(v * dx + v * ds + ufl.avg(v) * dS)
     assert fem.form(constant * v * dx).cells is W.integration_cells
+
+
+# ---- Fourth order
+
+
+def test_orders_are_those_of_the_arguments() -> None:
+    f, n = fem.Function(V), ufl.FacetNormal(MESH)
+    third = grad(div(grad(v)))[0]
+    for integral, orders in (
+        (u * v * dx, (0, 0)),
+        (inner(grad(u), grad(v)) * dx, (1, 1)),
+        (u * div(grad(v)) * dx, (2, 0)),
+        (u.dx(0) * third * dx + div(grad(u)) * v * dx, (3, 2)),
+        (div(grad(f)) * v * dx, (0,)),
+        (div(grad(f)) * dx, ()),
+        (ufl.jump(grad(ufl.TestFunction(W)[0].dx(1)), n) * dS, (2,)),
+    ):
+        assert fem.form(integral).orders == orders
+
+
+WHEELS = {valence: generators.wheel(valence, 2) for valence in (3, 4, 5)}
+
+
+@pytest.mark.parametrize(
+    ("valence", "cap_level", "deep"), [(3, 4, 6), (3, 5, 6), (3, 6, 0), (4, 1, 0), (5, 4, 8), (5, 7, 8), (5, 8, 0)]
+)
+def test_shallow_caps_are_warned_of_where_arguments_have_second_derivatives(
+    valence: int, cap_level: int, deep: int
+) -> None:
+    space = refined(fem.functionspace(WHEELS[valence], ("THCCS", 3), cap_level=cap_level), [0])
+    u, v, f = ufl.TrialFunction(space), ufl.TestFunction(space), fem.Function(space)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        fem.form([div(grad(u)) * v * dx, div(grad(v)) * dx])
+        fem.form([inner(grad(u), grad(v)) * dx, div(grad(f)) * v * dx, div(grad(f)) * dx])
+        integrated_otherwise = space.with_integration(paper_cells)
+        fem.form(div(grad(ufl.TestFunction(integrated_otherwise))) * dx)
+    assert [warning.filename for warning in caught] == [__file__] * (2 if deep else 0)
+    for warning in caught:
+        text = str(warning.message)
+        assert f"of valence {valence})" in text
+        assert f"at cap_level={cap_level} " in text
+        assert f"give functionspace cap_level={deep} " in text

@@ -76,10 +76,22 @@ def test_reaction_enters_form_and_residual() -> None:
     assert at_point(poisson.strong_residual(u, f, c=8)) == pytest.approx(1 / 2 + 3 / 4 - 8 / 32)
 
 
-@pytest.mark.parametrize("equation", [helmholtz, poisson])
+@pytest.mark.parametrize("equation", [helmholtz, laplace_beltrami, poisson])
 def test_flux_is_integrated_over_the_boundary(equation) -> None:
     expected = {"cell": pytest.approx(1 / 32), "exterior_facet": pytest.approx(3 / 16)}
     assert integrands(equation.L(f, v, g=ufl.as_ufl(3.0))) == expected
+
+
+def on_part(form: ufl.Form) -> dict[str, object]:
+    return {i.integral_type(): i.subdomain_id() for i in form.integrals()}
+
+
+def test_boundary_terms_are_where_ds_says() -> None:
+    g, ds, both = ufl.as_ufl(3.0), ufl.ds(7), {"cell": "everywhere", "exterior_facet": 7}
+    loads = [equation.L(f, v, g, ds) for equation in (helmholtz, laplace_beltrami, poisson)]
+    for form in (*loads, helmholtz.a(u, v, 1, z=2, ds=ds), heat.F(u, udot, v, f, g, ds=ds)):
+        assert on_part(form) == both
+    assert on_part(cahn_hilliard.contact(u, v, 0.5, 0.1, ds=ds)) == {"exterior_facet": 7}
 
 
 @pytest.mark.parametrize("equation", [laplace_beltrami, poisson])
@@ -96,8 +108,7 @@ def test_nitsche_is_consistency_symmetry_and_penalty(
     expected = -flux_u / 16 - flux_v * miss + 10 * across / 0.5 * miss / 16
     form = equation.nitsche(u, v, 5, 0.5, kappa, gamma=10)
     assert integrands(form) == {"exterior_facet": pytest.approx(expected)}
-    on_part = equation.nitsche(u, v, 5, 0.5, ds=ufl.ds(7))
-    assert [i.subdomain_id() for i in on_part.integrals()] == [7]
+    assert on_part(equation.nitsche(u, v, 5, 0.5, ds=ufl.ds(7))) == {"exterior_facet": 7}
 
 
 @pytest.mark.parametrize("equation", [laplace_beltrami, poisson])

@@ -56,6 +56,7 @@ def pinched(
 # ---- Strains
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: deep ones amplify rounding
 @on_surfaces
 def test_rigid_motions_strain_nothing(msh: ControlMesh) -> None:
     V = randomly_refined(fem.functionspace(msh, VECTOR), times=2)
@@ -69,6 +70,7 @@ def test_rigid_motions_strain_nothing(msh: ControlMesh) -> None:
             assert forces.max() < 1e-13
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: deep ones amplify rounding
 @on_surfaces
 def test_six_motions_and_no_others(msh: ControlMesh) -> None:
     A = stiffness(fem.functionspace(msh, VECTOR), 1.0, 0.3, 1.0).toarray()
@@ -167,7 +169,7 @@ def test_membrane_patch() -> None:
     flat = generators.disc(2)
     frame = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
     msh = ControlMesh(flat.vertices @ frame[:2], flat.quads)
-    V = fem.functionspace(msh, VECTOR)
+    V = fem.functionspace(msh, VECTOR, cap_level=8)
     gradient = np.random.default_rng(4).standard_normal((3, 3))
     x = ufl.SpatialCoordinate(msh)
     exact = ufl.dot(ufl.as_matrix(gradient.tolist()), x)
@@ -187,8 +189,8 @@ def test_a_flat_shell_is_a_plate_and_a_membrane() -> None:
     plane = generators.wheel(5, 2)
     flat = ControlMesh(np.pad(plane.vertices, ((0, 0), (0, 1))), plane.quads)
     E, nu, t = MATERIAL.values()
-    A = stiffness(fem.functionspace(flat, VECTOR), E, nu, t)
-    W, P = fem.functionspace(plane, ("THCCS", 3)), fem.functionspace(plane, ("THCCS", 3, (2,)))
+    A = stiffness(fem.functionspace(flat, VECTOR, cap_level=8), E, nu, t)
+    W, P = (fem.functionspace(plane, ("THCCS", 3, shape), cap_level=8) for shape in ((), (2,)))
     w, z = ufl.TrialFunction(W), ufl.TestFunction(W)
     u, v = ufl.TrialFunction(P), ufl.TestFunction(P)
     hessian, strain = lambda f: ufl.grad(ufl.grad(f)), lambda f: ufl.sym(ufl.grad(f))
@@ -274,7 +276,7 @@ def test_a_pinched_ring_bends_without_stretching() -> None:
 
 def test_forces_in_equilibrium_need_six_conditions_and_care_not_which() -> None:
     msh = generators.interpolated(generators.hemisphere(2))
-    V = fem.functionspace(msh, VECTOR)
+    V = fem.functionspace(msh, VECTOR, cap_level=8)
     values, forces = pinching(V)
     load = (values.T @ forces).ravel()
     A = stiffness(V, **MATERIAL)
@@ -335,15 +337,15 @@ def test_pinched_cylinder_refined_where_its_energy_is() -> None:
     ids=["extraordinary vertices", "hole of 18 degrees"],
 )
 def test_pinched_hemisphere(msh: ControlMesh, reference: float) -> None:
-    assert radial_displacement(fem.functionspace(generators.interpolated(msh), VECTOR)) == pytest.approx(
-        reference, rel=0.01
-    )
+    V = fem.functionspace(generators.interpolated(msh), VECTOR, cap_level=8)
+    assert radial_displacement(V) == pytest.approx(reference, rel=0.01)
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: they are compared
 def test_caps_at_extraordinary_vertices_do_no_harm() -> None:
     """Caps are but C0 between their sectors. Were that a hinge, the shell would get softer with each level."""
     msh = generators.interpolated(generators.hemisphere(4, 10.0))
-    radial = [radial_displacement(fem.functionspace(msh, VECTOR, cap_level=level)) for level in (1, 4, 7)]
+    radial = [radial_displacement(fem.functionspace(msh, VECTOR, cap_level=level)) for level in (1, 4, 8)]
     assert np.ptp(radial) < 1e-4 * radial[-1]
 
 

@@ -161,6 +161,7 @@ def test_a_function_that_only_the_truncation_changes_is_smoothed() -> None:
 MOST = {"laplace": 12, "biharmonic": 12}
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: the solver is tested
 @pytest.mark.parametrize("name", SPACES)
 @pytest.mark.parametrize("form", FORMS)
 def test_iterations(name: str, form: str) -> None:
@@ -188,6 +189,7 @@ def test_vectors(times: int) -> None:
     assert error < 2 * TOLERANCE
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: the solver is tested
 def test_a_new_matrix_is_noticed() -> None:
     V = space("wheel 5")
     A, B = matrix(V, laplace_beltrami.a), matrix(V, biharmonic.a)

@@ -28,7 +28,7 @@ import scipy.sparse as sp
 from thccs_fem import element
 from thccs_fem.extraction import WIDTH, Batch, Cells, Rows
 from thccs_fem.hierarchy import Hierarchy
-from thccs_fem.mesh import ControlMesh
+from thccs_fem.polygons import previous_corners
 from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN
 from thccs_fem.subdivision import Bools, Ints, Level
 
@@ -288,14 +288,7 @@ def _control_edges(hierarchy: Hierarchy, level: Level, half_edges: Ints) -> Ints
         key = key // 4
     if hierarchy.root_is_subdivided:  # face h of level 0 is the child at corner h
         inside |= (side == 1) | (side == 2)
-        corner = np.where(side == 0, key, _previous_corners(mesh)[key])
+        corner = np.where(side == 0, key, previous_corners(mesh.face_offsets)[key])
     else:
         corner = mesh.face_offsets[key] + side
     return np.where(inside, -1, mesh.face_edges[corner]).astype(np.int32)
-
-
-def _previous_corners(mesh: ControlMesh) -> Ints:
-    """Return the corner before each, around its face."""
-    previous = np.arange(-1, mesh.face_vertices.size - 1, dtype=np.int32)
-    previous[mesh.face_offsets[:-1]] = mesh.face_offsets[1:] - 1
-    return previous

@@ -118,6 +118,13 @@ def following_corners(offsets: Ints) -> Ints:
     return following
 
 
+def previous_corners(offsets: Ints) -> Ints:
+    """Return the corner before each, around its face."""
+    previous = np.arange(-1, offsets[-1] - 1, dtype=np.int32)
+    previous[offsets[:-1]] = offsets[1:] - 1
+    return previous
+
+
 def turned_over(polygons: Polygons, turned: Bools) -> Polygons:
     """Return the polygons, those marked walked the other way round from the same first corner."""
     start = np.repeat(polygons.offsets[:-1], polygons.sizes)

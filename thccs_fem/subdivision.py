@@ -24,7 +24,7 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.polygons import following_corners
+from thccs_fem.polygons import following_corners, previous_corners
 
 __all__ = [
     "Bools",
@@ -105,9 +105,7 @@ class Level:
     @cached_property
     def previous(self) -> Ints:
         """Half-edge before, around the same face, shape (num_half_edges,)."""
-        previous = np.arange(-1, self.vertices.size - 1, dtype=np.int32)
-        previous[self.offsets[:-1]] = self.offsets[1:] - 1
-        return previous
+        return previous_corners(self.offsets)
 
     @cached_property
     def rim(self) -> Bools:

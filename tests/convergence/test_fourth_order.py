@@ -143,6 +143,7 @@ def run(case: Case) -> npt.NDArray[np.float64]:
     return np.array(found)
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: they are among the cases
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_rates(case: Case) -> None:
     found = run(case)
@@ -151,6 +152,7 @@ def test_rates(case: Case) -> None:
     assert (found[-1] < MARGIN * np.array(case.last)).all()
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: what they cost
 def test_kinks_in_shallow_caps_cost_a_factor_and_no_rate() -> None:
     V = uniformly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3), cap_level=SHALLOW), 3)
     W = uniformly_refined(fem.functionspace(generators.wheel(5, 2), ("THCCS", 3), cap_level=DEEP), 3)

@@ -127,7 +127,7 @@ def _check_rank(form: Form, rank: int) -> None:
         raise TypeError(f"a compiled form is needed, fem.form(...), got {type(form).__module__}.{type(form).__name__}")
     if form.rank != rank:
         what = ("a scalar has no arguments", "a vector has a test function", "a matrix has a test and a trial function")
-        raise ValueError(f"the form of {what[rank]}, but the number of arguments here is {form.rank}")
+        raise ValueError(f"the form of {what[rank]}, but this one has {form.rank} arguments")
 
 
 def _new_matrix(form: Form) -> sp.csr_array:

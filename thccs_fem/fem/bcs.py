@@ -80,10 +80,10 @@ def boundary_dofs(
         TypeError: If V is no space of splines.
         ValueError: If both a marker and a tag are given, or the marker returns another shape.
     """
+    V = V.space if isinstance(V, Component) else V
     check_space(V, "boundary_dofs")
     if marker is not None and tag is not None:
         raise ValueError("give a marker or a tag, not both")
-    V = V.space if isinstance(V, Component) else V
     cells = V.cells
     piece, side, edge = cells.boundary_pieces
     chosen = np.ones(piece.size, dtype=bool)

@@ -213,7 +213,7 @@ class Layout:
             TypeError: A condition is none.
             ValueError: A condition is on a space of no unknown, or of two.
         """
-        found = [constraints(of_space, V) for of_space, V in zip(self._sorted(bcs), self.spaces, strict=True)]
+        found = [constraints(of_space, V) for of_space, V in zip(self._sorted(bcs or ()), self.spaces, strict=True)]
         dofs = [first + dofs for first, (dofs, _) in zip(self.offsets[:-1], found, strict=True)]
         return np.concatenate(dofs), np.concatenate([values for _, values in found])
 
@@ -257,8 +257,9 @@ def constraints(bcs: Sequence[DirichletBC], V: FunctionSpace) -> tuple[Ints, Flo
         if not isinstance(bc, DirichletBC):
             raise TypeError(f"bcs holds a {type(bc).__name__}: make conditions with fem.dirichletbc(value, dofs, V)")
         if bc.function_space != V:
+            where = "" if bc.function_space.mesh is V.mesh else " of another mesh"
             raise ValueError(
-                f"a condition is on {bc.function_space}, but the unknown is in {V}: make it with "
+                f"a condition is on {bc.function_space}{where}, but the unknown is in {V}: make it with "
                 f"fem.dirichletbc(value, dofs, V) for that space, with dofs found for it"
             )
     dofs = np.concatenate([np.zeros(0, dtype=np.int32), *(bc.dofs for bc in reversed(bcs))])

@@ -1,15 +1,28 @@
-"""What a form must be before it is compiled: one mesh, functions with values, measures and tags that are there."""
+"""What a form must be before it is compiled: one mesh, functions with values, measures and tags that are there.
+
+And what it should be: of fourth order on deep caps alone.
+"""
 
 from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
 
 import ufl
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
+from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh, Domain
+from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.domain import extract_domains
 
-__all__ = ["MEASURES", "check_metadata", "check_no_facets", "checked_mesh"]
+__all__ = ["MEASURES", "argument_orders", "check_caps", "check_metadata", "check_no_facets", "checked_mesh", "lowered"]
+
+# Cap levels at which the kinks of caps are no larger than other errors, by docs/fourth_order.md.
+DEEP, DEEP_AT_VALENCE_3 = 8, 6
 
 #: What is integrated over, in FFCx's order, and its measure.
 MEASURES = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
@@ -68,6 +81,43 @@ def check_metadata(ufl_form: ufl.Form, degree: int) -> None:
                 f"the metadata {metadata} ask for a rule of their own, but the cells of the space are made for degree "
                 f"{degree} alone: leave them out, or integrate on a space without with_integration"
             )
+
+
+def lowered(ufl_form: ufl.Form) -> ufl.Form:
+    """Return a form with all derivatives taken: those that are left are of coefficients and arguments."""
+    return apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(ufl_form))
+
+
+def argument_orders(ufl_form: ufl.Form) -> tuple[int, ...]:
+    """Return how often each argument of a form is differentiated at the most, in the order of their numbers."""
+    orders = dict.fromkeys(ufl_form.arguments(), 0)
+    for integral in lowered(ufl_form).integrals():
+        for node in unique_pre_traversal(integral.integrand()):
+            times = 0
+            while isinstance(node, ufl.classes.Grad):
+                (node,), times = node.ufl_operands, times + 1
+            if node in orders:
+                orders[node] = max(orders[node], times)
+    return tuple(orders.values())
+
+
+def check_caps(ufl_form: ufl.Form, hierarchy: Hierarchy) -> None:
+    """Warn of shallow caps where second derivatives of arguments see their kinks.
+
+    Warns:
+        UserWarning: There are some.
+    """
+    root = hierarchy.root
+    valences = root.vertex_num_faces[~root.regular & ~root.boundary]
+    needed = 0 if not valences.size else DEEP_AT_VALENCE_3 if (valences == 3).all() else DEEP
+    if hierarchy.cap_level < needed and max(argument_orders(ufl_form), default=0) > 1:
+        warnings.warn(
+            f"the form has second derivatives of its test or trial function, and the mesh extraordinary vertices (of "
+            f"valence {', '.join(map(str, np.unique(valences)))}), near which functions are C1 up to kinks in bicubic "
+            f"caps. Of caps at cap_level={hierarchy.cap_level} these can be most of the error: give functionspace "
+            f"cap_level={needed} (see docs/fourth_order.md)",
+            skip_file_prefixes=(str(Path(__file__).parents[1]),),
+        )
 
 
 def _checked_form(ufl_form: object) -> ufl.Form:

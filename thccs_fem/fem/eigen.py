@@ -133,7 +133,9 @@ class EigenSystem:
         w = np.repeat(wave, V.block_size)[self.free]
         return self.target - AWAY * abs(float(w @ (self.A @ w) / (w @ (self.M @ w))))
 
-    def complete(self, search: Search, count: Callable[[float], int] | None) -> tuple[Floats, Floats]:
+    def complete(
+        self, search: Search, count: Callable[[float], int] | None, accuracy: float = 0.0
+    ) -> tuple[Floats, Floats]:
         """Return the eigenvalues nearest to the target, none of them missing, or fewer if a search finds fewer.
 
         The last of them may be copies of one eigenvalue that has more.
@@ -143,6 +145,7 @@ class EigenSystem:
                 their number, the vectors (shape (n, k)) to which theirs are to be m-orthogonal, and a vector to start
                 from.
             count: Returns how many eigenvalues there are below a number; None: what the first search finds is taken.
+            accuracy: Of the eigenvalues found, relative to their distances from the target.
 
         Returns:
             Eigenvalues, those wanted first, shape (k,), and their vectors, shape (n, k).
@@ -161,7 +164,7 @@ class EigenSystem:
             values, vectors = values[nearest], vectors[:, nearest]
             if values.size < self.num_eigenvalues:
                 return values, vectors
-            missing = self._missing(values, count)
+            missing = self._missing(values, count, max(SAME, 10.0 * accuracy))
             if missing == 0:
                 return values, vectors
             if missing < 0 or more[0].size == 0:
@@ -172,11 +175,17 @@ class EigenSystem:
             f"help: another target; see that m is positive, as the square of a norm"
         )
 
-    def _missing(self, eigenvalues: Floats, count: Callable[[float], int]) -> int:
-        """Return how many more eigenvalues there are nearer to the target than the last one wanted, and its copies."""
+    def _missing(self, eigenvalues: Floats, count: Callable[[float], int], relative: float) -> int:
+        """Return how many more eigenvalues there are nearer to the target than the last one wanted, and its copies.
+
+        Args:
+            eigenvalues: The nearest first.
+            count: As above.
+            relative: Difference of distances from the target that count as one.
+        """
         distances = np.abs(eigenvalues - self.target)[: self.num_eigenvalues]
         largest = (np.abs(self.A.diagonal()) / self.M.diagonal()).max()
-        same = max(SAME * distances[-1], ROUNDING * largest)
+        same = max(relative * distances[-1], ROUNDING * largest)
         first = int(np.flatnonzero(np.diff(distances, prepend=-np.inf) > same)[-1])  # of the last one's copies
         radius = distances[first] - same / 2.0
         if radius <= 0.0:

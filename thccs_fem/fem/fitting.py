@@ -6,6 +6,7 @@ of the cells if not all of them reach the boundary. Value and slope are fitted o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -58,16 +59,15 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
     if not functions.size:
         return np.zeros((0, k))
     if slope:
-        parts = (_value_and_slope(V, functions, value, k), _on_cells(V, functions, value, k, is_around=True))
-        basis = sp.csr_array(sp.vstack([part[0] for part in parts], format="csr"))
-        weights, values = (np.concatenate([part[i] for part in parts]) for i in (1, 2))
+        parts = [_value_and_slope(V, functions, value, k), _on_cells(V, functions, value, k, is_around=True)]
     else:
-        basis, weights, values = _on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)
-    weights = np.where(np.isfinite(values).all(axis=1), weights, 0.0)  # around the part, it need not be defined
-    weighted = sp.csr_array(sp.diags_array(weights) @ basis)
-    present = np.unique(weighted.indices)
-    mass = sp.csc_array((basis.T @ weighted)[present][:, present])
-    load = (weighted.T @ np.nan_to_num(values))[present]
+        parts = [_on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)]
+    mass, load = parts[0].equations()
+    for part in parts[1:]:
+        more_mass, more_load = part.equations()
+        mass, load = mass + more_mass, load + more_load
+    present = np.flatnonzero(mass.diagonal() > 0.0)
+    mass, load = sp.csc_array(mass[present][:, present]), load[present]
     regular = mass.copy()
     regular.setdiag((1.0 + RIDGE) * mass.diagonal())
     factors = spla.splu(regular)
@@ -76,25 +76,47 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
     return fitted[np.searchsorted(present, functions)]
 
 
-def _on_boundary(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
-) -> tuple[sp.csr_array, Floats, Floats] | None:
-    """Return basis, weights and values at Gauss points of the boundary; None if a function has no trace there."""
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Values at points of n sides or pieces, in each of which there are m local functions.
+
+    Attributes:
+        rows: Local coefficients of all functions, shape (n m, num_functions).
+        basis: Local functions at the points, shape (n or 1, points, m).
+        weights: Weights of the points, shape (n, points).
+        values: What is to be fitted there, shape (n, points, k).
+    """
+
+    rows: sp.csr_array
+    basis: Floats
+    weights: Floats
+    values: Floats
+
+    def equations(self) -> tuple[sp.csr_array, Floats]:
+        """Return matrix and right-hand side of the least squares, of all functions."""
+        is_finite = np.isfinite(self.values).all(axis=2, keepdims=True)  # around the part, it need not be defined
+        weighted = (np.where(is_finite, self.weights[:, :, None], 0.0) * self.basis).swapaxes(1, 2)
+        mass, load = weighted @ self.basis, weighted @ np.where(is_finite, self.values, 0.0)
+        n, m, _ = mass.shape
+        blocks = sp.bsr_array((mass, np.arange(n), np.arange(n + 1)), shape=(n * m, n * m))
+        return sp.csr_array(self.rows.T @ (blocks.tocsr() @ self.rows)), self.rows.T @ load.reshape(n * m, -1)
+
+
+def _on_boundary(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> _Part | None:
+    """Return the values at Gauss points of the boundary; None if a function has no trace there."""
     piece, side, _ = V.cells.boundary_pieces
     rows = side_rows(V.cells, piece, side, depth=1)
     if not np.isin(functions, rows.indices).all():
         return None
     chosen, is_inside = _blocks(rows, functions, 4)
     sides = _Sides(V, piece[chosen], side[chosen])
-    basis = sides.table(element.bernstein_values(sides.t)) @ rows[(4 * chosen[:, None] + np.arange(4)).ravel()]
     values = sides.values_of(value, k)
-    return sp.csr_array(basis), _weighted(sides.lengths, values, is_inside), values.reshape(-1, k)
+    weights = _weighted(sides.lengths, values, is_inside)
+    return _Part(_rows_of(rows, chosen, 4), element.bernstein_values(sides.t)[None], weights, values)
 
 
-def _value_and_slope(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int
-) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the boundary, then the same of h times the slope.
+def _value_and_slope(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> _Part:
+    """Return the values at Gauss points of the boundary, then h times the slopes there.
 
     h is the width of the piece across the boundary, so that values and slopes weigh alike at every size of the cells.
 
@@ -117,16 +139,13 @@ def _value_and_slope(
     values = sides.values_of(value, k)
     gradients = sides.values_of(ufl.grad(value), k * V.mesh.gdim).reshape(*values.shape, V.mesh.gdim)
     slopes = np.einsum("nqkc,nqc->nqk", gradients, sides.across)
-    rows = sp.csr_array(rows[(8 * chosen[:, None] + np.arange(8)).ravel()])
     both = np.concatenate([values, slopes], axis=1)
     weights = _weighted(np.tile(sides.lengths, 2), both, is_inside)
-    return sp.csr_array(sides.table(sides.value_and_slope()) @ rows), weights, both.reshape(-1, k)
+    return _Part(_rows_of(rows, chosen, 8), sides.value_and_slope(), weights, both)
 
 
-def _on_cells(
-    V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, is_around: bool = False
-) -> tuple[sp.csr_array, Floats, Floats]:
-    """Return basis, weights and values at Gauss points of the pieces that the functions live on.
+def _on_cells(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, is_around: bool = False) -> _Part:
+    """Return the values at Gauss points of the pieces that the functions live on.
 
     With `is_around` all of them are around what is prescribed.
     """
@@ -138,11 +157,9 @@ def _on_cells(
     points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
     basis = element.bspline_values(points)
     table = (basis[:, 1, :, None] * basis[:, 0, None, :]).reshape(-1, 16)
-    rows = sp.csr_array(all_rows[(16 * piece[:, None] + np.arange(16)).ravel()])
-    at_points = sp.csr_array(sp.kron(sp.eye_array(piece.size), sp.csr_array(table), format="csr") @ rows)
     weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
     values = values_at(value, V, piece, points, k)
-    return at_points, _weighted(weights, values, is_inside), values.reshape(-1, k)
+    return _Part(_rows_of(all_rows, piece, 16), table[None], _weighted(weights, values, is_inside), values)
 
 
 def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
@@ -157,15 +174,20 @@ def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, 
     return chosen, num_foreign[chosen] == 0
 
 
+def _rows_of(rows: sp.csr_array, blocks: Ints, height: int) -> sp.csr_array:
+    """Return blocks of `height` rows."""
+    return sp.csr_array(rows[(height * blocks[:, None] + np.arange(height)).ravel()])
+
+
 def _weighted(weights: Floats, values: Floats, is_inside: Bools) -> Floats:
-    """Return the weights of shape (n, points), made small outside, in one row."""
+    """Return the weights of shape (n, points), made small outside."""
     bad = ~np.isfinite(values).all(axis=(1, 2)) & is_inside
     if bad.any():
         raise ValueError(
             f"the value is not finite on {np.count_nonzero(bad)} of the {np.count_nonzero(is_inside)} edges or patches "
             f"of surface that the dofs determine: prescribe finite values"
         )
-    return (weights * np.where(is_inside, 1.0, AROUND)[:, None]).ravel()
+    return weights * np.where(is_inside, 1.0, AROUND)[:, None]
 
 
 # ---- Sides of pieces ----------------------------------------------------------------------------------------------
@@ -241,14 +263,6 @@ class _Sides:
         first = np.concatenate([value, -3.0 * value - along], axis=1)
         second = np.concatenate([np.zeros_like(value), 3.0 * value], axis=1)
         return np.concatenate([first, second], axis=2)
-
-    def table(self, values: Floats) -> sp.csr_array:
-        """Return a table of local functions of each side, or one for all, as a matrix of diagonal blocks."""
-        values = np.broadcast_to(values, (self.piece.size, *values.shape[-2:]))
-        n, rows, columns = values.shape
-        indices = np.broadcast_to(np.arange(n * columns).reshape(n, 1, columns), values.shape)
-        indptr = columns * np.arange(n * rows + 1)
-        return sp.csr_array((values.ravel(), indices.ravel(), indptr), shape=(n * rows, n * columns))
 
 
 def _gauss() -> tuple[Floats, Floats]:

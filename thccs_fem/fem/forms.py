@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 from typing import Any, overload
 
@@ -16,12 +17,19 @@ import scipy.sparse as sp
 import ufl
 from thccs_fem import element, jit
 from thccs_fem.extraction import Cells, extract
-from thccs_fem.fem.checks import MEASURES, check_metadata, check_no_facets, checked_mesh
+from thccs_fem.fem.checks import (
+    MEASURES,
+    argument_orders,
+    check_caps,
+    check_metadata,
+    check_no_facets,
+    checked_mesh,
+    lowered,
+)
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, functionspace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh
-from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 from ufl.algorithms.estimate_degrees import SumDegreeEstimator
 from ufl.corealg.map_dag import map_expr_dags
 
@@ -85,6 +93,11 @@ class Form:
         """The control mesh."""
         return self.hierarchy.mesh
 
+    @cached_property
+    def orders(self) -> tuple[int, ...]:
+        """How often each argument is differentiated at the most: none of a scalar, (test,), or (test, trial)."""
+        return argument_orders(self.ufl_form)
+
 
 @overload
 def form(
@@ -127,6 +140,9 @@ def form(
             restricted to one side, or, on cells with a quadrature of their own, another one or integrals over facets.
         NotImplementedError: It has integrals other than dx, ds and dS.
         OSError: There is no C compiler, or the cache can't be written.
+
+    Warns:
+        UserWarning: Arguments have second derivatives, and caps at extraordinary vertices are too shallow for that.
     """
     if isinstance(ufl_form, Form):
         return ufl_form
@@ -139,7 +155,9 @@ def form(
     finest = _finest(all_spaces) if all_spaces else functionspace(mesh, ("THCCS", element.DEGREE))
     cells = finest.integration_cells
     hierarchy = cells.hierarchy if finest.hierarchy is None else finest.hierarchy
-    if finest.integration is not extract:
+    if finest.integration is extract:
+        check_caps(ufl_form, hierarchy)
+    else:
         check_no_facets(ufl_form)
     if cells.quadrature_degree is not None:
         quadrature_degree = cells.quadrature_degree
@@ -189,7 +207,7 @@ def _compiled(ufl_form: ufl.Form) -> tuple[Any, ModuleType]:
     try:
         (compiled,), module = jit.compile_forms([ufl_form])
     except Exception as error:
-        if "restrict" not in str(error).lower() or type(error) is OSError:
+        if "restrict" not in str(error).lower() or isinstance(error, OSError):
             raise
         raise ValueError(
             f"{error} In integrals over dS each side has its own value of gradients, normals and functions that are "
@@ -224,8 +242,7 @@ class _ParametricDegree(SumDegreeEstimator):
 
 def _quadrature_degree(integral: ufl.Integral) -> int:
     """Return the default degree: see `form`."""
-    lowered = apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(ufl.Form([integral])))
-    integrands = [part.integrand() for part in lowered.integrals()]
+    integrands = [part.integrand() for part in lowered(ufl.Form([integral])).integrals()]
     estimator = _ParametricDegree(element.DEGREE, {})  # type: ignore[no-untyped-call]  # the base class's __init__
     degrees = map_expr_dags(estimator, integrands)
     return min(max(LEAST_DEGREE, *degrees), LARGEST_DEGREE) if degrees else LEAST_DEGREE

@@ -22,12 +22,11 @@ import ufl
 from thccs_fem.fem import blocks
 from thccs_fem.fem.assembly import assemble_vector
 from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout, constraints
+from thccs_fem.fem.checks import lowered
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
-from ufl.algorithms import apply_algebra_lowering, apply_derivatives
-from ufl.corealg.traversal import unique_pre_traversal
 
 __all__ = [
     "Constants",
@@ -270,14 +269,10 @@ def drops_constants(a: Sequence[Sequence[Form | None]], spaces: Sequence[Functio
 
 def _drops(a: Form, number: int) -> Bools:
     """Return for each component of one argument whether the form is zero where it is constant."""
-    lowered = _lowered(a)
+    form = lowered(a.ufl_form)
     V = a.spaces[number]
     constants = [ufl.as_vector(unit.tolist()) for unit in np.eye(V.block_size)] if V.value_shape else [ufl.as_ufl(1.0)]
-    return np.array([ufl.replace(lowered, {a.ufl_form.arguments()[number]: c}).empty() for c in constants])
-
-
-def _lowered(a: Form) -> ufl.Form:
-    return apply_derivatives.apply_derivatives(apply_algebra_lowering.apply_algebra_lowering(a.ufl_form))
+    return np.array([ufl.replace(form, {a.ufl_form.arguments()[number]: c}).empty() for c in constants])
 
 
 def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: Ints | None = None) -> Constants | None:
@@ -334,16 +329,7 @@ def is_symmetric(A: sp.csr_array) -> bool:
 
 def is_fourth_order(a: Sequence[Sequence[Form | None]]) -> bool:
     """Return whether a bilinear form has second derivatives of its arguments."""
-    integrands = (part.integrand() for row in a for block in row if block for part in _lowered(block).integrals())
-    return any(_is_second_derivative(node) for integrand in integrands for node in unique_pre_traversal(integrand))
-
-
-def _is_second_derivative(node: Any) -> bool:
-    """Return whether it is the gradient of the gradient of an argument."""
-    times = 0
-    while isinstance(node, ufl.classes.Grad):
-        node, times = node.ufl_operands[0], times + 1
-    return times > 1 and isinstance(node, ufl.Argument)
+    return any(max(block.orders) > 1 for row in a for block in row if block)
 
 
 def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:

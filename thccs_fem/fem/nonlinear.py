@@ -128,16 +128,20 @@ class NonlinearSystem:
         jump = np.zeros(x.size)
         jump[self._dofs] = self._values - x[self._dofs]
         if (np.abs(jump[self._dofs]) > MET * (np.abs(self._values) + np.abs(x[self._dofs]))).any():
-            b += self._assembled() @ jump
+            # Not in `A`, which may still be in use: solvers may keep a Jacobian for several steps.
+            b += BlockMatrix(self.jacobians, self.layout.spaces).whole @ jump
         b[self._dofs] = -jump[self._dofs]
         return b if self.constants is None else self.constants.cleared(b)
 
     def jacobian(self, x: Floats) -> sp.csr_array:
         """Return the Jacobian for coefficients x, which become those of the unknowns; rows of conditions are I's."""
         self.layout.spread(x, self.unknowns)
-        A = self._assembled()
-        constrain(A, self._dofs)
-        return A
+        if self._matrix is None:
+            self._matrix = BlockMatrix(self.jacobians, self.layout.spaces)
+        else:
+            self._matrix.assemble()
+        constrain(self._matrix.whole, self._dofs)
+        return self._matrix.whole
 
     def regular(self) -> sp.csr_array:
         """Return the Jacobian, or where constants are in its kernel, a regular matrix that makes the same steps."""
@@ -153,14 +157,6 @@ class NonlinearSystem:
         x[self._dofs] = self._values
         self.layout.spread(x, self.unknowns)
         return self.u
-
-    def _assembled(self) -> sp.csr_array:
-        """Return the Jacobian without conditions."""
-        if self._matrix is None:
-            self._matrix = BlockMatrix(self.jacobians, self.layout.spaces)
-        else:
-            self._matrix.assemble()
-        return self._matrix.whole
 
 
 def _derivatives(residuals: Sequence[ufl.Form | Form | None], u: Sequence[Function]) -> list[list[ufl.Form | None]]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 import numpy.typing as npt
@@ -11,17 +13,20 @@ import scipy.sparse as sp
 import basix
 import ufl
 from thccs_fem import element
+from thccs_fem.extraction import Cells
 from thccs_fem.fem.assembly import assemble_matrix, assemble_vector
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.scipy import conjugate_gradients, solve
+from thccs_fem.fem.scipy.linear import conjugate_gradients, solver
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.hierarchy import Hierarchy
 
-__all__ = ["project", "projected_over"]
+__all__ = ["Projection", "integrals", "project", "projector"]
 
 Floats = npt.NDArray[np.float64]
 Norm = Literal["L2", "H1"]
+Rule = Callable[[Hierarchy], Cells]
 
 DEGREE = 11  # of the quadrature, 6 x 6 points: the same on both sides, so that functions of V stay what they are
 TOLERANCE = 1e-13  # mass matrices are scaled by their diagonal: 100 to 300 iterations on any mesh and refinement
@@ -49,39 +54,73 @@ def project(value: ValueOrExpression, V: FunctionSpace) -> Function:
     mass = assemble_matrix(
         form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
     )
-    projection = Function(V)
+    result = Function(V)
     components = [conjugate_gradients(mass, b, TOLERANCE) for b in load.T]
-    projection.x.array = np.stack(components, axis=1).ravel()
-    return projection
+    result.x.array = np.stack(components, axis=1).ravel()
+    return result
 
 
-def projected_over(common: FunctionSpace, u: Function, V: FunctionSpace, norm: Norm) -> Floats:
-    """Return the function of V nearest to u, all integrals being over the cells of a refinement of both spaces.
+class Projection:
+    """The projection from one space to another, all integrals being over the cells of a refinement of both.
 
-    With G the inner products of the functions of `common`, and P and Q the prolongations to it from V and from the
-    space of u, P^T G P x = P^T G Q u. Constants lie in all three spaces, so that either norm keeps the integral of u
+    With G the inner products of the functions of `common`, and P and Q the prolongations to it from the target and from
+    the source, P^T G P x = P^T G Q u. Constants lie in all three spaces, so that either norm keeps the integral of u
     (over these cells). What the solver leaves of the residual against constants, a constant takes away.
 
     Args:
-        common: Scalar space that refines V and the space of u.
-        u: Function with values of the shape of V's.
-        V: The space.
+        common: Scalar space that refines both.
+        source: Where functions are.
+        target: Where they are wanted.
         norm: "L2": (x, v). "H1": (x, v) + (grad x, grad v).
-
-    Returns:
-        Coefficients, shape (num_dofs of V,).
     """
-    trial, test = ufl.TrialFunction(common), ufl.TestFunction(common)
-    product = ufl.inner(trial, test)
-    if norm == "H1":
-        product += ufl.inner(ufl.grad(trial), ufl.grad(test))
-    G = assemble_matrix(form(product * ufl.dx, quadrature_degree=DEGREE))
-    P, Q = (common.hierarchy.prolongation(W.hierarchy) for W in (V, u.function_space))
-    load = P.T @ (G @ (Q @ u.x.array.reshape(-1, V.block_size)))
-    A = sp.csr_array(P.T @ G @ P)
-    x = np.stack([solve(A, b) for b in load.T], axis=1)
-    x += (load - A @ x).sum(axis=0) / A.sum()
-    return x.ravel()
+
+    def __init__(self, common: FunctionSpace, source: Hierarchy, target: Hierarchy, norm: Norm):
+        trial, test = ufl.TrialFunction(common), ufl.TestFunction(common)
+        product = ufl.inner(trial, test)
+        if norm == "H1":
+            product += ufl.inner(ufl.grad(trial), ufl.grad(test))
+        G = assemble_matrix(form(product * ufl.dx, quadrature_degree=DEGREE))
+        P, self._from_source = (common.hierarchy.prolongation(hierarchy) for hierarchy in (target, source))
+        self._to_target = sp.csr_array(P.T @ G)
+        self._matrix = sp.csr_array(self._to_target @ P)
+        self._solve = solver(self._matrix, TOLERANCE)
+
+    def __call__(self, values: Floats) -> Floats:
+        """Return the coefficients of the projections of functions, one in each column."""
+        load = self._to_target @ (self._from_source @ values)
+        x = self._solve(load)
+        return x + (load - self._matrix @ x).sum(axis=0) / self._matrix.sum()
+
+
+# The last projection from each hierarchy, for as long as that lives: several functions are carried over at once, but
+# one after the other.
+_last: WeakKeyDictionary[Hierarchy, tuple[ref[Hierarchy], Rule, Norm, Projection]] = WeakKeyDictionary()
+
+
+def projector(source: Hierarchy, V: FunctionSpace, norm: Norm) -> Projection:
+    """Return the projection from a hierarchy to that of V; the same one if asked for again.
+
+    Args:
+        source: Where functions are.
+        V: The space where they are wanted; its rule of integration is used.
+        norm: "L2" or "H1".
+
+    Raises:
+        ValueError: They have no common refinement.
+    """
+    target, rule = V.hierarchy, V.integration
+    if source in _last:
+        known, *key, found = _last[source]
+        if known() is target and key == [rule, norm]:
+            return found
+    made = Projection(FunctionSpace(target.common_refinement(source), (), rule), source, target, norm)
+    _last[source] = ref(target), rule, norm, made
+    return made
+
+
+def integrals(V: FunctionSpace) -> Floats:
+    """Return the integral of each scalar function of V, as `form` integrates if nothing is said."""
+    return assemble_vector(form(ufl.TestFunction(FunctionSpace(V.hierarchy, (), V.integration)) * ufl.dx))
 
 
 def _as_ufl(value: object, V: FunctionSpace) -> ufl.core.expr.Expr:

@@ -53,8 +53,10 @@ class FunctionSpace(ufl.FunctionSpace):
         integration: Callable[[Hierarchy], Cells] = extract,
     ):
         if not isinstance(hierarchy, Hierarchy):
-            given = type(hierarchy).__name__
-            raise TypeError(f'FunctionSpace needs a Hierarchy, got {given}: use functionspace(msh, ("THCCS", 3))')
+            raise TypeError(
+                f"FunctionSpace needs a Hierarchy, got {type(hierarchy).__name__}: spaces on a mesh come from "
+                f'functionspace(msh, ("THCCS", 3))'
+            )
         super().__init__(  # type: ignore[no-untyped-call]  # UFL is typed in part
             hierarchy.mesh.ufl_domain(), element.blocked(value_shape) if value_shape else element.bspline()
         )

@@ -36,8 +36,11 @@ class EigenProblem:
     and what is set in code on `solver`. If nothing is said, the eigenvalues are those nearest to a target, by the
     Krylov-Schur method with shift and invert (``st_type`` "sinvert"), factorised by MUMPS if PETSc has it, to
     ``eps_tol`` 1e-12. Where the target is an eigenvalue, as zero on a closed surface, the shift is moved a little below
-    it. Then none is missing: they are counted, by two factorisations more; of the last one, which may be multiple, there
-    are as many copies as were asked for. With other transforms, or other ``eps_which``, nobody counts.
+    it.
+
+    None is missing, which Krylov's methods do not see to where eigenvalues are multiple: they are counted, by two
+    factorisations more, and searched for again until their number is right. Of the last one, which may be multiple,
+    there are as many copies as were asked for. With other transforms, and other ``eps_which``, nothing is counted.
 
     Args:
         a: Symmetric bilinear form.
@@ -118,8 +121,9 @@ class EigenProblem:
             solver.setOperators(A, M)
             solver.getST().setShift(self._shift())
         is_nearest = solver.getWhichEigenpairs() == SLEPc.EPS.Which.TARGET_MAGNITUDE
+        count = self._count if is_nearest and self._inverts() else None
         try:
-            values, vectors = system.complete(self._search, self._count if is_nearest and self._inverts() else None)
+            values, vectors = system.complete(self._search, count, accuracy=solver.getTolerances()[0])
         finally:
             solver.setDimensions(system.num_eigenvalues)
         self._options.warn_unused()

@@ -25,8 +25,11 @@ class EigenProblem:
     """Find the numbers lambda and functions u with a(u, v) = lambda m(u, v) for all v, by Lanczos' method.
 
     The eigenvalues are those nearest to a target, by shift and invert. Where the target is one of them, as zero on a
-    closed surface, the shift is moved a little below it. None is missing: they are counted, by two factorisations more;
-    of the last one, which may be multiple, there are as many copies as were asked for.
+    closed surface, the shift is moved a little below it.
+
+    None is missing, which Lanczos' method does not see to where eigenvalues are multiple: they are counted, by two
+    factorisations more, and searched for again until their number is right. Of the last one, which may be multiple,
+    there are as many copies as were asked for.
 
     Args:
         a: Symmetric bilinear form.

@@ -21,7 +21,7 @@ from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import LinearSystem, check_regular, check_residual, is_symmetric
 
-__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "num_negative", "solve"]
+__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "num_negative", "solve", "solver"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -119,6 +119,28 @@ def solve(A: sp.csr_array, b: Floats) -> Floats:
     return _direct(A, b)
 
 
+def solver(A: sp.csr_array, tolerance: float = TOLERANCE) -> Callable[[Floats], Floats]:
+    """Return what solves A x = b for any b, shape (n,) or (n, k), for a symmetric positive definite matrix.
+
+    It is factorised but once, or if it is large, solved by conjugate gradients.
+
+    Args:
+        A: Shape (n, n).
+        tolerance: Of conjugate gradients, for the norm of the residual, relative to that of b.
+
+    Raises:
+        RuntimeError: The matrix is singular, to working precision.
+    """
+    if A.nnz <= LARGEST_DIRECT:
+        return factorised(A)
+
+    def iterated(b: Floats) -> Floats:
+        columns = [conjugate_gradients(A, column, tolerance) for column in b.reshape(b.shape[0], -1).T]
+        return np.stack(columns, axis=1).reshape(b.shape)
+
+    return iterated
+
+
 def conjugate_gradients(A: sp.csr_array, b: Floats, tolerance: float) -> Floats:
     """Return the solution of A x = b for a symmetric positive definite matrix, with Jacobi's preconditioner.
 
@@ -170,15 +192,18 @@ def factorised(A: sp.csr_array) -> Callable[[Floats], Floats]:
 def num_negative(A: sp.csr_array) -> int:
     """Return the number of negative eigenvalues of a symmetric matrix.
 
-    With pivots from the diagonal alone, the factors L U are L D L^T, and D has as many negative entries as A has negative
-    eigenvalues (Sylvester). They are right for a matrix that differs from A by rounding times the growth of the pivots.
+    With pivots from the diagonal alone, the factors L U are L D L^T, and D has as many negative entries as A has
+    negative eigenvalues (Sylvester). They are those of a matrix that differs from A by rounding times the growth of the
+    pivots.
 
     Raises:
         RuntimeError: There is no such factorisation.
     """
     factors = _factors(A, 0.0)
     if not np.array_equal(factors.perm_r, factors.perm_c):
-        raise RuntimeError("SuperLU met a zero on the diagonal, so that eigenvalues cannot be counted: change the target")
+        raise RuntimeError(
+            "SuperLU met a zero on the diagonal, so that eigenvalues cannot be counted: move the target a little"
+        )
     return int(np.count_nonzero(factors.U.diagonal() < 0.0))
 
 
