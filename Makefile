@@ -14,7 +14,7 @@ demo: $(ready)
 	$(python) demos/laplace_on_surface.py
 
 test: $(ready)
-	$(python) -m pytest
+	$(python) -m pytest --numprocesses=auto --dist=loadfile
 
 lint: $(ready)
 	$(python) -m ruff check .

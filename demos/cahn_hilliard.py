@@ -91,7 +91,8 @@ def remeshed(u: fem.Function) -> fem.FunctionSpace:
 #
 # On a curved surface there is a catch. Areas of bicubic patches are integrals of square roots. Quadrature errs there by
 # a little, on other cells by something else, and so the same function has another integral after each change of mesh.
-# Here that is up to a millionth, but it would add up. `conserve=True` adds a constant to the function that gives it back.
+# Here that is up to a millionth, but it would add up. A constant, added to the function, gives it back: that is
+# `conserve=True`.
 
 
 # %%
@@ -207,8 +208,8 @@ print(f"Wrote {out / 'cahn_hilliard.png'}")
 #
 # ## Check
 #
-# The integral of $u$ is that of the start, to rounding. Each step loses energy. The projection is the nearest function in L2, not the one with the least energy, and adds some: in
-# all less than a hundredth of what the steps lose.
+# The integral of $u$ is that of the start, to rounding. Each step loses energy. The projection is the nearest function
+# in L2, not the one with the least energy, and adds some: in all less than a hundredth of what the steps lose.
 
 # %%
 drift = np.abs(np.array(masses) / masses[0] - 1.0).max()

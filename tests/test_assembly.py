@@ -460,8 +460,18 @@ def test_matrix_of_other_spaces_is_not_refilled() -> None:
     V = ZOO["torus"]()
     fine = randomly_refined(V)
     forms = [fem.form(ufl.TrialFunction(S) * ufl.TestFunction(S) * dx) for S in (V, fine)]
-    with pytest.raises(ValueError, match="give a matrix that was assembled from a form with the same spaces"):
-        fem.assemble_matrix(fem.assemble_matrix(forms[0]), forms[1])
+    carried = fem.form(fem.Function(fine) * ufl.TrialFunction(V) * ufl.TestFunction(V) * dx)
+    for wrong, refilling in (forms, (forms[1], carried)):
+        with pytest.raises(ValueError, match="give a matrix that was assembled from a form with the same spaces"):
+            fem.assemble_matrix(fem.assemble_matrix(wrong), refilling)
+
+
+@pytest.mark.parametrize(("length", "dtype"), [(256, np.uint8), (257, np.uint16)])
+def test_positions_in_the_longest_row_of_each_type(length: int, dtype: type) -> None:
+    dofs = np.arange(length, dtype=np.int32)
+    pattern = sparsity._new_pattern(length, np.array([length], dtype=np.int32), dofs)
+    assert pattern.positions.dtype == dtype
+    np.testing.assert_array_equal(pattern.positions.reshape(length, length), np.tile(dofs, (length, 1)))
 
 
 def test_too_many_entries_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

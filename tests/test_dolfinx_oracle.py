@@ -236,6 +236,7 @@ def problem(on: Any, scalars: Any, vectors: Any, f: Floats, g: Floats, cells: np
     return p
 
 
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: whatever the pieces
 @pytest.mark.parametrize("kind", FORMS)
 def test_forms_as_dolfinx_assembles_them(oracle: Oracle, kind: str) -> None:
     make = FORMS[kind]

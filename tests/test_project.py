@@ -141,3 +141,37 @@ def test_values_that_are_not_finite_are_refused() -> None:
     for value in (lambda x: x[0] * np.nan, np.inf, ufl.ln(ufl.SpatialCoordinate(V.mesh)[0])):
         with pytest.raises(ValueError, match="the value is not finite everywhere"):
             fem.project(value, V)
+
+
+@pytest.mark.parametrize("name", ["torus", "wheel5", "polygons"])
+def test_on_cells_it_is_the_mean(name: str) -> None:
+    V = space(name, times=2)
+    g = ufl.SpatialCoordinate(V.mesh)[0] ** 2
+    faces = fem.functionspace(V.mesh, ("DG", 0))
+    for W, cell in ((fem.cellwise(V), np.arange(V.num_cells)), (faces, V.cells.face)):
+        integrals, areas = (
+            np.bincount(cell, weights=fem.assemble_cells(fem.form(f * dx, quadrature_degree=11, on=V)))
+            for f in (g, fem.Constant(V.mesh, 1.0))
+        )
+        finest = g + fem.Function(V)  # integrated on the cells of V, as above
+        np.testing.assert_allclose(fem.project(finest, W).x.array, integrals / areas, rtol=1e-12)
+        np.testing.assert_allclose(fem.project(lambda x: x[0] ** 2, W).x.array, fem.project(g, W).x.array, rtol=1e-12)
+        np.testing.assert_allclose(fem.project(3.5, W).x.array, 3.5, rtol=1e-12)
+
+
+def test_on_cells_with_components() -> None:
+    msh = generators.rectangle((3, 2))
+    W = fem.functionspace(msh, ("DG", 0, (2,)))
+    x = ufl.SpatialCoordinate(msh)
+    centres = msh.vertices[msh.quads].mean(axis=1)
+    for value in (x, lambda x: x[:2]):
+        np.testing.assert_allclose(fem.project(value, W).x.array.reshape(-1, 2), centres, rtol=1e-12)
+    with pytest.raises(ValueError, match="cannot be projected on functions of shape"):
+        fem.project(x[0], W)
+    with pytest.raises(ValueError, match="not finite"):
+        fem.project(lambda x: np.nan * x[:2], W)
+
+
+def test_on_something_else() -> None:
+    with pytest.raises(TypeError, match="project needs a space"):
+        fem.project(1.0, generators.rectangle((2, 2)))  # type: ignore[arg-type]  # what is tested

@@ -49,6 +49,8 @@ FLAGS = (
     "-fassociative-math",
     "-freciprocal-math",
     "-g0",
+    "-Wno-unused-variable",  # FFCx declares tables that it may not use: that is no news to who writes a form
+    "-Wno-unused-const-variable",
 )
 
 # FFCx rounds table entries to 0 and 1 within its tolerance. Its default, 1e-9, is wrong for B-splines: products of two
