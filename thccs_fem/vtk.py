@@ -78,6 +78,7 @@ def _save(grid: pyvista.UnstructuredGrid, draft: Path, path: Path) -> None:
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetFileName(str(draft))
     writer.SetInputData(grid)
+    writer.SetCompressionLevel(1)  # half the time of VTK's 5, for files larger by a fiftieth
     if not writer.Write():
         reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
         raise OSError(
