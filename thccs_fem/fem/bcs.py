@@ -78,7 +78,7 @@ def boundary_dofs(
 
     Raises:
         TypeError: If V is no space of splines.
-        ValueError: If both a marker and a tag are given, or the marker returns another shape.
+        ValueError: If both a marker and a tag are given, or no edge has the tag, or the marker returns another shape.
     """
     V = V.space if isinstance(V, Component) else V
     check_space(V, "boundary_dofs")
@@ -112,7 +112,7 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
 
     Raises:
         TypeError: If the faces are no integers, or V is no space of splines.
-        ValueError: If not just one of `faces` and `tag` is given, or a face is out of range.
+        ValueError: If not just one of `faces` and `tag` is given, a face is out of range, or no face has the tag.
     """
     check_space(V, "region_dofs")
     if (faces is None) == (tag is None):
@@ -120,6 +120,10 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
     marked = np.zeros(V.mesh.num_faces, dtype=bool)
     if faces is None:
         marked |= V.mesh.face_tags == tag
+        if not marked.any():
+            raise ValueError(
+                f"no face of the mesh has the tag {tag}; tags of faces are {sorted({int(t) for t in V.mesh.face_tags})}"
+            )
     else:
         marked[_indices(faces, "faces", V.mesh.num_faces)] = True
     cells = V.cells
@@ -212,6 +216,11 @@ def _tagged_half_edges(V: FunctionSpace, tag: int) -> Bools:
     """Return the half-edges of the control mesh whose edge carries the tag."""
     mesh = V.mesh
     pairs = [edge for edge, t in mesh.edge_tags.items() if t == tag]
+    if not pairs:
+        raise ValueError(
+            f"no edge of the mesh has the tag {tag}; tags of edges are {sorted(set(mesh.edge_tags.values()))}, from "
+            f"ControlMesh(..., edge_tags={{(i, j): tag}})"
+        )
     tagged = np.zeros(mesh.num_edges, dtype=bool)
     tagged[mesh.edge_indices(np.array(pairs, dtype=np.int32).reshape(-1, 2))] = True
     return tagged[mesh.face_edges]
