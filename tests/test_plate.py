@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from problems import moved_inside, uniformly_refined
+from problems import lifted, moved_inside, uniformly_refined
 
 import ufl
 from thccs_fem import fem, generators, limit
@@ -191,9 +191,30 @@ def test_weak_conditions_are_symmetric_and_positive(edge: Callable[..., ufl.Form
         assert np.linalg.eigvalsh((K + K.T) / 2)[0] > 0
 
 
+@pytest.mark.parametrize("nu", [0.0, 0.3])
+def test_moments_obey_greens_formula_on_a_curved_patch(nu: float) -> None:
+    msh = ControlMesh([[0.0, 0.0, 0.0], [1.0, 0.0, 0.3], [1.0, 1.0, 0.7], [0.0, 1.0, 0.1]], [[0, 1, 2, 3]])
+    V = space(msh)
+    u, v, n = fem.Function(V), fem.Function(V), ufl.FacetNormal(msh.ufl_domain())
+    for f, seed in ((u, 0), (v, 1)):
+        f.x.array = np.random.default_rng(seed).standard_normal(V.num_dofs)
+    m = plate.moments(u, 1.0, nu)
+    work, edge, inside = (
+        fem.assemble_scalar(fem.form(w, quadrature_degree=21))
+        for w in (
+            inner(m, plate.hessian(v)) * dx,
+            dot(dot(m, n), grad(v)) * ufl.ds,
+            inner(div(m), grad(v)) * dx,
+        )
+    )
+    assert work == pytest.approx(edge - inside, abs=1e-12 * (abs(edge) + abs(inside)))
+
+
+@pytest.mark.parametrize("mesh", ["plane", "bowl"])
 @pytest.mark.parametrize("slope", [True, False])
-def test_weak_conditions_do_as_strong_ones(slope: bool) -> None:
-    V = space(generators.disc(2), 2)
+def test_weak_conditions_do_as_strong_ones(mesh: str, slope: bool) -> None:
+    msh = generators.disc(2)
+    V = space(msh if mesh == "plane" else lifted(msh), 2)
     strong = loaded(V, slope=slope)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     edge = plate.clamped if slope else plate.supported
