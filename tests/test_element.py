@@ -81,3 +81,13 @@ def test_blocked_elements_are_made_once(shape: tuple[int, ...]) -> None:
 
 def test_coordinate_element_has_a_component_for_each_dimension() -> None:
     assert element.coordinate_element(3) is element.blocked((3,))
+
+
+def test_function_i_plus_4_j_is_a_product() -> None:
+    points = np.random.default_rng(0).random((2, 3, 2))
+    values = element.bicubic_values(points)
+    assert values.shape == (2, 3, 16)
+    for i in range(4):
+        for j in range(4):
+            product = uniform_bspline(i, points[..., 0]) * uniform_bspline(j, points[..., 1])
+            np.testing.assert_allclose(values[..., i + 4 * j], product, atol=1e-15)

@@ -24,6 +24,7 @@ from refinements import (
 from thccs_fem import limit
 from thccs_fem.extraction import WIDTH, evaluate_pieces, extract
 from thccs_fem.hierarchy import Hierarchy
+from thccs_fem.subdivision import Level
 
 EXACT = 1e-12  # sums of some dozen products of numbers up to 1
 NESTED = 1e-11  # a few levels of them
@@ -67,7 +68,7 @@ def test_faces_with_four_corners_of_valence_3_are_never_all_that_is_left_of_leve
     assert not coarse.support(far)[0][~support].all()
     assert np.isin(np.flatnonzero(~support), coarse.refined(far).refined_keys[0]).all()
 
-    monkeypatch.setattr("thccs_fem.hierarchy._dependent_faces", lambda root: np.zeros(root.num_faces, dtype=bool))
+    monkeypatch.setattr(Level, "dependent_faces", property(lambda root: np.zeros(root.num_faces, dtype=bool)))
     cells = extract(coarse.refined(np.array([0])))
     assert independence(cells, bernstein_rows(cells)) < 1e-12
 

@@ -127,7 +127,7 @@ def test_facets_know_their_cells() -> None:
 def test_lines_go_once_around_each_cell(name: str) -> None:
     cells = space(ZOO[name]()).cells
     lengths = np.abs(cells.piece_axes).sum(axis=1)  # of the sides along u and v, in the cell
-    around = (plot._on_cell_boundary(cells) * np.tile(lengths, 2)).sum(axis=1)
+    around = (cells.on_cell_edges * np.tile(lengths, 2)).sum(axis=1)
     np.testing.assert_array_equal(np.bincount(cells.piece_cell, around), np.full(cells.num_cells, 4.0))
 
 

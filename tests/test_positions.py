@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zoo import grid, polygons
 
-from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, in_quads, in_sub_quads
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, in_quads, in_sub_quads, side_points
 
 COORDINATE = st.floats(0.0, 1.0)
 
@@ -51,3 +51,10 @@ def test_wrong_positions_are_refused(function: Callable[..., object]) -> None:
         function(mesh, [1], (0.0, 0.0))
     with pytest.raises(TypeError, match="must be integers"):
         function(mesh, [1.5], [(0.0, 0.0)])
+
+
+def test_points_on_sides_run_from_corner_to_corner() -> None:
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    points = side_points([0.0, 0.25, 1.0])
+    following = np.roll(corners, -1, axis=0)
+    np.testing.assert_array_equal(points, np.stack([corners, 0.75 * corners + 0.25 * following, following], axis=1))

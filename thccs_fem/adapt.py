@@ -20,8 +20,9 @@ import scipy.sparse as sp
 
 from thccs_fem import estimate
 from thccs_fem.extraction import Cells
+from thccs_fem.fem.assembly import integrals
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.project import integrals, projector
+from thccs_fem.fem.project import projector
 from thccs_fem.fem.space import FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
 

@@ -37,7 +37,7 @@ def coarsened(level: Level, rule: BoundaryRule) -> tuple[Level, sp.csr_array] | 
     if old is None:
         return None
     coarse, children = _parents(level, old)
-    if not coarse.touching(coarse.boundary | (coarse.vertex_num_faces != 3)).all():
+    if coarse.dependent_faces.any():
         return None
     return coarse, _matrix(coarse, level, children, rule)
 

@@ -80,7 +80,7 @@ def mesh(V: FunctionSpace | CellwiseSpace) -> dolfinx.mesh.Mesh[np.float64]:
 
 def _mesh(cells: Cells, comm: MPI.Comm) -> dolfinx.mesh.Mesh[np.float64]:
     lagrange = basix.ufl.element("Lagrange", "quadrilateral", element.DEGREE)
-    points = _bsplines(lagrange.basix_element.points) @ cells.piece_points
+    points = element.bicubic_values(lagrange.basix_element.points) @ cells.piece_points
     num_pieces, num_nodes, gdim = points.shape
     coordinates: Any = basix.ufl.blocked_element(lagrange, shape=(gdim,))  # what DOLFINx takes, by another type's name
     return dolfinx.mesh.create_mesh(
@@ -142,10 +142,4 @@ def _piece(Q: dolfinx.fem.FunctionSpace[np.float64]) -> Ints:
 
 def _at_nodes(Q: dolfinx.fem.FunctionSpace[np.float64]) -> Floats:
     """Return the values of the 16 local functions at the nodes of a cell, shape (16 nodes, 16)."""
-    return _bsplines(Q.element.interpolation_points)
-
-
-def _bsplines(points: Floats) -> Floats:
-    """Return the values of the 16 local functions at points of the reference square, shape (points, 16)."""
-    along = element.bspline_values(points[:, :2])
-    return (along[:, 1, :, None] * along[:, 0, None, :]).reshape(-1, element.NUM_FUNCTIONS)
+    return element.bicubic_values(Q.element.interpolation_points[:, :2])

@@ -56,6 +56,12 @@ def bspline_slopes(t: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return bernstein_slopes(t) @ (_TO_BERNSTEIN_TIMES_6 / 6)
 
 
+def bicubic_values(points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the 16 functions at points of the reference square, shape (..., 2), as a last axis of length 16."""
+    x, y = np.moveaxis(bspline_values(points), -2, 0)
+    return (y[..., :, None] * x[..., None, :]).reshape(*x.shape[:-1], NUM_FUNCTIONS)
+
+
 def restrictions(origin: npt.NDArray[np.float64], axes: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return the matrices that take local B-spline coefficients of bicubic polynomials to those on other squares.
 

@@ -23,7 +23,7 @@ from thccs_fem import element, jit
 from thccs_fem.bezier import bezier_masks, spline_grid
 from thccs_fem.hierarchy import Hierarchy, Stage
 from thccs_fem.limit import evaluate_patches
-from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at
+from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, side_points
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["Batch", "Cells", "Rows", "evaluate_pieces", "extract"]
@@ -174,6 +174,12 @@ class Cells:
     def piece_cell(self) -> Ints:
         """Cell of each piece, shape (num_pieces,)."""
         return np.concatenate([batch.piece_cells for batch in self.batches])
+
+    @cached_property
+    def on_cell_edges(self) -> Bools:
+        """Which sides of the pieces lie on the edges of their cells, shape (num_pieces, 4)."""
+        middles = self.piece_origin[:, None] + side_points([0.5])[:, 0] @ self.piece_axes.transpose(0, 2, 1)
+        return ((middles == 0.0) | (middles == 1.0)).any(axis=2)  # dyadic numbers: exact
 
     @cached_property
     def piece_points(self) -> Floats:

@@ -30,7 +30,7 @@ from thccs_fem.extraction import WIDTH, Batch, Cells, Rows
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.polygons import previous_corners
 from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN
-from thccs_fem.subdivision import Bools, Ints, Level
+from thccs_fem.subdivision import Ints, Level
 
 __all__ = ["FacetBatch", "Facets", "boundary_facets", "interior_facets"]
 
@@ -223,7 +223,7 @@ def _meeting(cells: Cells, l: int) -> tuple[Ints, Floats, Ints]:
     """Return the facets whose shorter side is a piece of level l: pieces (n, 2), squares (n, 2, 6), and edges (n,)."""
     level, piece_of_face = cells.hierarchy.stages[l].level, cells.piece_of_face[l]
     own: Ints = np.flatnonzero((level.twins >= 0) & (piece_of_face[level.face] >= 0)).astype(np.int32)
-    own = own[_on_cell_edges(cells, piece_of_face[level.face[own]], own % 4)]
+    own = own[cells.on_cell_edges[piece_of_face[level.face[own]], own % 4]]
     twin = level.twins[own]
     other, origin, axes = _held_by(cells, l, level.face[twin])
     # Where pieces of one level meet, one of the two half-edges stands for both; where none is found, pieces are finer.
@@ -240,13 +240,6 @@ def _meeting(cells: Cells, l: int) -> tuple[Ints, Floats, Ints]:
         np.take_along_axis(squares, swap[:, :, None], axis=1),
         _control_edges(cells.hierarchy, level, own),
     )
-
-
-def _on_cell_edges(cells: Cells, piece: Ints, side: Ints) -> Bools:
-    """Return which sides of pieces lie on the edges of their cells."""
-    middle = CHILD_ORIGIN + CHILD_AXES @ [0.5, 0.0]
-    in_cell = cells.piece_origin[piece] + np.einsum("nij,nj->ni", cells.piece_axes[piece], middle[side])
-    return ((in_cell == 0.0) | (in_cell == 1.0)).any(axis=1)  # dyadic numbers: exact
 
 
 def _held_by(cells: Cells, l: int, face: Ints) -> tuple[Ints, Floats, Floats]:

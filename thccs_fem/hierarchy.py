@@ -232,7 +232,7 @@ class Hierarchy:
         for l, (stage, support) in enumerate(zip(stages, supports, strict=True)):
             refined = stage.refined | support
             free = _with_all_children(stage, spare[l + 1]) & ~support if l + 1 < len(stages) else ~refined
-            along = _dependent_faces(stage.level) if l == 0 else np.zeros_like(refined)
+            along = stage.level.dependent_faces if l == 0 else np.zeros_like(refined)
             kept = refined & (~free | along)
             cover = _cover(stage, kept & ~along, kept, refined)
             keys.append(stage.level.keys[cover | (along & cover.any())])
@@ -319,18 +319,9 @@ class Hierarchy:
         return self.num_levels == other.num_levels and self.is_refinement_of(other) and other.is_refinement_of(self)
 
 
-def _dependent_faces(root: Level) -> Bools:
-    """Return the faces with four corners of valence 3, inside, shape (num_faces,).
-
-    On such a face, and on no other, the functions of level 0 are dependent: S annihilates their alternating
-    vector there.
-    """
-    return ~root.touching(root.boundary | (root.vertex_num_faces != 3))
-
-
 def _is_dependent(root: Level) -> bool:
     """Return whether a component has only vertices of valence 3, the cube: its functions are dependent as a whole."""
-    return not bool(neighbourhood(root, ~_dependent_faces(root)).all())
+    return not bool(neighbourhood(root, ~root.dependent_faces).all())
 
 
 def _as_level_zero(level: Level) -> Level:

@@ -21,7 +21,8 @@ from thccs_fem import element
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.subdivision import Bools, Ints
+from thccs_fem.positions import side_points
+from thccs_fem.subdivision import Ints
 from thccs_fem.vtk import cell_numbers, in_space, one_for_each_cell
 
 if TYPE_CHECKING:  # imported where it is needed: it takes its time
@@ -45,8 +46,6 @@ FAINT = 20.0  # pixels: where cells are smaller, lines are faint, else one would
 INK = "#20242c"  # colour of letters and of lines on it
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of red, green and blue
 ROUNDING = 1e-9  # values that differ less, of the largest, are one
-
-CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])  # side k of a piece: corner k to corner k + 1
 
 Floats = npt.NDArray[np.float64]
 
@@ -165,7 +164,7 @@ def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.Po
     import pyvista
 
     cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
-    outer = _on_cell_boundary(cells)
+    outer = cells.on_cell_edges
     points, sampled, lines, cell = [], [], [], []
     num_points = 0
     for n, pieces in _by_segments(points_of_pieces, values):
@@ -261,17 +260,7 @@ def _grid_facets(num_pieces: int, n: int) -> npt.NDArray[np.int_]:
 
 def _on_sides(n: int) -> Floats:
     """Return the B-splines on the sides of a piece, from corner to corner, shape (4, n + 1, 16)."""
-    t = np.linspace(0.0, 1.0, n + 1)[:, None]
-    uv = (1.0 - t) * CORNERS[:, None] + t * np.roll(CORNERS, -1, axis=0)[:, None]
-    values = element.bspline_values(uv)
-    return (values[:, :, 1, :, None] * values[:, :, 0, None, :]).reshape(4, n + 1, element.NUM_FUNCTIONS)
-
-
-def _on_cell_boundary(cells: Cells) -> Bools:
-    """Return which sides of the pieces are on the sides of their cells, shape (num_pieces, 4)."""
-    corners = cells.piece_origin[:, None] + CORNERS @ cells.piece_axes.transpose(0, 2, 1)
-    on_edge = (corners == 0.0) | (corners == 1.0)  # dyadic numbers: exact
-    return (on_edge & (corners == np.roll(corners, -1, axis=1))).any(axis=2)
+    return element.bicubic_values(side_points(np.linspace(0.0, 1.0, n + 1)))
 
 
 def _checked(path: Path) -> Path:

@@ -10,13 +10,18 @@ import numpy.typing as npt
 
 from thccs_fem.mesh import ControlMesh
 
-__all__ = ["CHILD_AXES", "CHILD_ORIGIN", "child_at", "in_quads", "in_sub_quads"]
+__all__ = ["CHILD_AXES", "CHILD_ORIGIN", "child_at", "in_quads", "in_sub_quads", "side_points"]
 
 Ints = npt.NDArray[np.int32]
 
 # Child k of a quad: parent (u, v) = CHILD_ORIGIN[k] + CHILD_AXES[k] @ child (u, v) / 2; axes in columns.
 CHILD_ORIGIN = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 CHILD_AXES = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]], dtype=float)
+
+
+def side_points(t: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return points on the sides of a quad, side k from corner k to corner k + 1, shape (4, n, 2), t shape (n,)."""
+    return CHILD_ORIGIN[:, None] + CHILD_AXES[:, None, :, 0] * np.asarray(t)[:, None]
 
 
 def child_at(uv: npt.NDArray[np.float64]) -> tuple[Ints, npt.NDArray[np.float64]]:

@@ -143,6 +143,15 @@ class Level:
         ends = np.cumsum(sizes)
         return (starts + np.arange(starts.size) - np.repeat(ends - sizes, sizes)).astype(np.int32)
 
+    @property
+    def dependent_faces(self) -> Bools:
+        """Faces with four corners of valence 3, inside, shape (num_faces,).
+
+        On such a face, and on no other, the functions of the level are dependent: S annihilates their alternating
+        vector there.
+        """
+        return ~self.touching(self.boundary | (self.vertex_num_faces != 3))
+
     def touching(self, vertices: Bools) -> Bools:
         """Return the faces that have at least one of the marked vertices, shape (num_faces,)."""
         hit = np.zeros(self.num_faces, dtype=bool)

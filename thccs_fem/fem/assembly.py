@@ -14,14 +14,16 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+import ufl
 from thccs_fem.fem.forms import Form
+from thccs_fem.fem.forms import form as compile_form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.loops import cell_loops, loops
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.fem.sparsity import Pattern, pattern, pointer
 from thccs_fem.jit import library
 
-__all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector", "bubble_energies"]
+__all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector", "bubble_energies", "integrals"]
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -92,6 +94,11 @@ def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /)
         return _new_matrix(form)
     _refill(form, refilling)
     return form
+
+
+def integrals(V: FunctionSpace) -> Floats:
+    """Return the integral of each scalar function of V, as `form` integrates if nothing is said, (num_functions,)."""
+    return assemble_vector(compile_form(ufl.TestFunction(FunctionSpace(V.hierarchy, (), V.integration)) * ufl.dx))
 
 
 def bubble_energies(a: Form, L: Form, u: Function) -> Floats:

@@ -19,6 +19,7 @@ from thccs_fem.fem.expression import ValueOrExpression
 from thccs_fem.fem.fitting import fitted, side_rows
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import Component, FunctionSpace, check_space
+from thccs_fem.positions import side_points
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["DirichletBC", "boundary_dofs", "dirichletbc", "locate_dofs_geometrical", "region_dofs"]
@@ -90,10 +91,8 @@ def boundary_dofs(
     if tag is not None:
         chosen = _tagged_half_edges(V, tag)[edge]
     if marker is not None:
-        middle = np.stack([[0.5, 0.0], [1.0, 0.5], [0.5, 1.0], [0.0, 0.5]])
-        corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
         points = cells.piece_points[piece]
-        for position in (corners[side], middle[side], corners[(side + 1) % 4]):
+        for position in side_points([0.0, 0.5, 1.0])[side].swapaxes(0, 1):
             chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
     rows = side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
     return np.unique(rows.indices).astype(np.int32)

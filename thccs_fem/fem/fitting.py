@@ -19,6 +19,7 @@ from thccs_fem import element
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.positions import side_points
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["fitted", "side_rows"]
@@ -155,11 +156,10 @@ def _on_cells(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k:
     is_inside &= not is_around
     t, w = _gauss()
     points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
-    basis = element.bspline_values(points)
-    table = (basis[:, 1, :, None] * basis[:, 0, None, :]).reshape(-1, 16)
     weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
     values = values_at(value, V, piece, points, k)
-    return _Part(_rows_of(all_rows, piece, 16), table[None], _weighted(weights, values, is_inside), values)
+    basis = element.bicubic_values(points)[None]
+    return _Part(_rows_of(all_rows, piece, 16), basis, _weighted(weights, values, is_inside), values)
 
 
 def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
@@ -250,10 +250,7 @@ class _Sides:
 
     def values_of(self, value: ValueOrExpression, k: int) -> Floats:
         """Return values with k components, shape (n, q, k)."""
-        start = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        along = np.roll(start, -1, axis=0) - start
-        points = start[:, None] + along[:, None] * self.t[:, None]  # (4 sides, Gauss points, 2)
-        values = values_at(value, self.V, self.piece, points.reshape(-1, 2), k)
+        values = values_at(value, self.V, self.piece, side_points(self.t).reshape(-1, 2), k)
         return values.reshape(self.piece.size, 4, self.t.size, k)[np.arange(self.piece.size), self.side]
 
     def value_and_slope(self) -> Floats:

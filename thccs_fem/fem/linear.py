@@ -20,10 +20,10 @@ from scipy.sparse import csgraph
 
 import ufl
 from thccs_fem.fem import blocks
-from thccs_fem.fem.assembly import assemble_vector
+from thccs_fem.fem.assembly import integrals
 from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout, constraints
 from thccs_fem.fem.checks import lowered
-from thccs_fem.fem.forms import Form, form
+from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.subdivision import Bools, Ints
@@ -306,17 +306,13 @@ def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: 
     unknown = np.repeat(np.arange(len(layout.spaces), dtype=np.int32), [V.num_dofs for V in layout.spaces])
     load = unknown + len(layout.spaces) * part
     load[[] if dofs is None else dofs] = -1
-    return Constants(number[part, component], np.concatenate([_integrals(V) for V in layout.spaces]), load)
+    each = [np.repeat(integrals(FunctionSpace(V.hierarchy)), V.block_size) for V in layout.spaces]
+    return Constants(number[part, component], np.concatenate(each), load)
 
 
 def _vanishing(A: Any, ones: Floats, tolerance: Floats) -> Bools:
     """Return where A @ ones is but rounding."""
     return np.abs(A @ ones) <= tolerance * (abs(A) @ np.ones(A.shape[1]))[:, None]
-
-
-def _integrals(V: FunctionSpace) -> Floats:
-    scalar = FunctionSpace(V.hierarchy)
-    return np.repeat(assemble_vector(form(ufl.TestFunction(scalar) * ufl.dx)), V.block_size)
 
 
 # ---- Has it worked? --------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from thccs_fem.fem.scipy.linear import conjugate_gradients, solver
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
 
-__all__ = ["Projection", "integrals", "project", "projector"]
+__all__ = ["Projection", "project", "projector"]
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -123,11 +123,6 @@ def projector(source: Hierarchy, V: FunctionSpace, norm: Norm) -> Projection:
     return made
 
 
-def integrals(V: FunctionSpace) -> Floats:
-    """Return the integral of each scalar function of V, as `form` integrates if nothing is said."""
-    return assemble_vector(form(ufl.TestFunction(FunctionSpace(V.hierarchy, (), V.integration)) * ufl.dx))
-
-
 def _check_finite(integrals: Floats) -> None:
     if not np.isfinite(integrals).all():
         raise ValueError("the value is not finite everywhere on the surface: give one that is")
@@ -165,10 +160,8 @@ def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
 def _load_at_points(value: ValueOrExpression, V: FunctionSpace) -> Floats:
     """Return the same for g(x)."""
     pieces, points, areas = _quadrature(V.cells)
-    along = element.bspline_values(points)
-    basis = (along[:, 1, :, None] * along[:, 0, None, :]).reshape(-1, 16)
     values = values_at(value, V, pieces, points, V.block_size) * areas[:, :, None]
-    local = np.einsum("qi,pqc->pic", basis, values).reshape(-1, V.block_size)
+    local = np.einsum("qi,pqc->pic", element.bicubic_values(points), values).reshape(-1, V.block_size)
     return V.cells.rows(pieces).T @ local
 
 

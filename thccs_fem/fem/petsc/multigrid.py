@@ -27,6 +27,7 @@ import scipy.sparse as sp
 
 from thccs_fem.boundary import traces_meeting
 from thccs_fem.coarsening import coarsened
+from thccs_fem.fem.petsc.matrices import sharing
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.subdivision import Bools, Ints, neighbourhood
@@ -160,8 +161,7 @@ def _set_smoother(ksp: PETSc.KSP, functions: Ints) -> None:
 
 def _mat(A: sp.csr_array, comm: Any) -> PETSc.Mat:
     A.sort_indices()  # which PETSc takes for granted
-    csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
-    return PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=comm)
+    return sharing(A, comm)
 
 
 # ---- The levels ------------------------------------------------------------------------------------------------------
