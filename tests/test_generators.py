@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ranks import ranks
 from scipy.spatial import KDTree
 
 from thccs_fem import generators, limit, subdivision
@@ -419,7 +420,9 @@ def test_interpolated_limits_are_near_the_surface(
 
 def test_interpolated_meshes_keep_what_is_tagged() -> None:
     plain = generators.l_domain(2)
-    given = ControlMesh(plain.vertices, plain.quads, [3] * 12, {(0, 1): 5}, corners=dict(plain.corners), comm=object())
+    given = ControlMesh(
+        plain.vertices, plain.quads, [3] * 12, {(0, 1): 5}, corners=dict(plain.corners), comm=ranks(1)[0]
+    )
     moved = generators.interpolated(given)
     assert moved.face_tags.tolist() == given.face_tags.tolist()
     assert (dict(moved.edge_tags), dict(moved.corners), moved.comm) == (
@@ -622,7 +625,7 @@ MAKERS: dict[str, Callable[..., ControlMesh]] = {
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS.keys())
 def test_communicator_is_handed_on(make: Callable[..., ControlMesh]) -> None:
-    comm = object()
+    (comm,) = ranks(1)
     assert make(comm=comm).comm is comm
     assert make().comm is None
 

@@ -11,7 +11,9 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
+from ranks import on_ranks
 
+from thccs_fem import io
 from thccs_fem.io import read_mesh
 from thccs_fem.mesh import ControlMesh
 
@@ -513,33 +515,20 @@ def test_path_may_be_a_string(write: Write) -> None:
     assert_cube(read_mesh(str(write("cube.obj", V + F))))
 
 
-class FakeComm:
-    """Stands for one of two ranks: what rank 0 sends, rank 1 gets."""
-
-    size = 2
-    sent: Any = None
-
-    def __init__(self, rank: int) -> None:
-        self.rank = rank
-
-    def bcast(self, value: Any, root: int = 0) -> Any:
-        assert root == 0
-        if self.rank == 0:
-            FakeComm.sent = value
-        return FakeComm.sent
-
-
-def test_rank_0_reads_for_all(write: Write) -> None:
+def test_rank_0_reads_for_all(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write("cube.obj", V + F)
-    zero, one = FakeComm(0), FakeComm(1)
-    assert read_mesh(path, zero).comm is zero
+    read: list[Path] = []
+    monkeypatch.setattr(io, "_read", lambda path, read_file=io._read: read.append(path) or read_file(path))
+    first, second = on_ranks(2, lambda comm: read_mesh(path, comm))
+    assert read == [path]
+    for rank, msh in enumerate([first, second]):
+        assert isinstance(msh, ControlMesh)
+        assert (msh.comm.rank, msh.comm.size) == (rank, 2)
+        assert_cube(msh)
     path.unlink()
-    msh = read_mesh(path, comm=one)
-    assert msh.comm is one
-    assert_cube(msh)
-    for rank in (zero, one):
-        with pytest.raises(FileNotFoundError):
-            read_mesh(path, rank)
+    for error in on_ranks(2, lambda comm: read_mesh(path, comm)):
+        assert str(error) == f"[Errno 2] No such file or directory: '{path}'"
+        assert isinstance(error, FileNotFoundError)
 
 
 FOLDER = Path(os.environ.get("THCCS_MESHES", "missing"))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from ranks import ranks
 
 import ufl
 from thccs_fem import generators, io
@@ -224,7 +225,7 @@ def test_tags_are_kept_by_ordered_pairs() -> None:
 
 
 def test_repr_and_comm() -> None:
-    comm = object()
+    (comm,) = ranks(1)
     msh = ControlMesh(*grid(2, 1), comm=comm)
     assert repr(msh) == "ControlMesh(gdim=2, num_vertices=6, num_edges=7, num_faces=2)"
     assert msh.comm is comm

@@ -17,6 +17,15 @@ import thccs_fem
 # defaults.
 ANY = inspect.Parameter.empty
 SIGNATURES = {
+    "parallel.size_of": "comm",
+    "parallel.rank_of": "comm",
+    "parallel.total": "comm, value",
+    "parallel.largest": "comm, value",
+    "parallel.smallest": "comm, value",
+    "parallel.gathered": "comm, array",
+    "parallel.together": "comm, work",
+    "parallel.by_first_rank": "comm, work",
+    "parallel.end_together": "comm",
     "mesh.ControlMesh": ("vertices, faces, face_tags=None, edge_tags=None, creases=None, corners=None, comm=None"),
     "mesh.ControlMesh.ufl_domain": "self",
     "mesh.end_faces": "msh, /, share=ANY",

@@ -1,6 +1,5 @@
 """Function spaces: what they count, where their functions sit, which of them are the same."""
 
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,12 +167,6 @@ def test_caps_need_a_cut() -> None:
         fem.functionspace(generators.torus((4, 4)), SCALAR, cap_level=0)
 
 
-def test_distributed_meshes_are_refused_so_far() -> None:
-    msh = generators.torus((4, 4), comm=SimpleNamespace(size=2))
-    with pytest.raises(NotImplementedError, match="the communicator has 2 ranks, but spaces are serial"):
-        fem.functionspace(msh, SCALAR)
-
-
 def test_planes_that_fold_are_refused() -> None:
     vertices = generators.rectangle((4, 4)).vertices.copy()
     vertices[12] += [0.9, 0.9]  # the centre goes past its neighbours
@@ -222,15 +215,15 @@ def test_cells_inherit_what_their_ancestors_have(name: str) -> None:
     fine = coarse
     for step in range(2):
         fine = adapt.refine(fine, np.arange(step, fine.num_functions, 3))
-    dofs = fem.cellwise(coarse).dofs_of(fine.cells)
+    dofs = fem.cellwise(coarse).numbers_of(fine.cells)
     np.testing.assert_array_equal(coarse.cells.face[dofs], fine.cells.face)
-    np.testing.assert_array_equal(fem.cellwise(fine).dofs_of(fine.cells), np.arange(fine.num_cells))
-    np.testing.assert_array_equal(fem.functionspace(fine.mesh, ("DG", 0)).dofs_of(fine.cells), fine.cells.face)
+    np.testing.assert_array_equal(fem.cellwise(fine).numbers_of(fine.cells), np.arange(fine.num_cells))
+    np.testing.assert_array_equal(fem.functionspace(fine.mesh, ("DG", 0)).numbers_of(fine.cells), fine.cells.face)
     areas = [fem.cell_sizes(V).x.array ** 2 for V in (coarse, fine)]
     # Caps sink where cells come near: areas of irregular cells change a little.
     np.testing.assert_allclose(np.bincount(dofs, weights=areas[1]), areas[0], rtol=1e-4)
     with pytest.raises(ValueError, match=r"values of .* cells are not known: .* goes over to finer cells only"):
-        fem.cellwise(fine).dofs_of(coarse.cells)
+        fem.cellwise(fine).numbers_of(coarse.cells)
 
 
 @pytest.mark.parametrize("element", [("DG", 1), ("DG",), ("DP", 0)])

@@ -5,12 +5,14 @@ irregular one is cut into three pieces a level and a cap.  On a piece, with u th
 
     local B-spline coefficients = operator @ u[dofs].
 
-Cells are numbered level by level, within a level in the order of its faces.  The local basis is that of
-`thccs_fem.element`: function i + 4 j, i along the piece's first edge.
+Cells are numbered level by level, within a level in the order of its faces; on several ranks each has a part of them
+(see `partition`), and numbers of its own for these.  The local basis is that of `thccs_fem.element`: function i + 4 j,
+i along the piece's first edge.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -22,7 +24,9 @@ import scipy.sparse as sp
 from thccs_fem import element, jit
 from thccs_fem.bezier import bezier_masks, spline_grid
 from thccs_fem.hierarchy import Hierarchy, Stage
+from thccs_fem.index_map import IndexMap
 from thccs_fem.limit import evaluate_patches
+from thccs_fem.partition import Partition, needed_functions, partition
 from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, side_points
 from thccs_fem.subdivision import Bools, Ints
 
@@ -77,10 +81,14 @@ class Batch:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of a hierarchy; pieces are numbered batch by batch.
+    """Cells of a hierarchy that this rank holds; pieces are numbered batch by batch.
+
+    The cells that it owns come first, then ghosts, both kinds in every batch; the same for functions. Numbers of cells
+    and dofs are local, here and in the batches.
 
     Attributes:
         hierarchy: The hierarchy.
+        partition: What this rank owns and holds of it.
         level: Level of each cell, shape (num_cells,).
         level_face: Face of the level's `Level`, shape (num_cells,).
         face: Face of the control mesh, shape (num_cells,).
@@ -93,6 +101,7 @@ class Cells:
     """
 
     hierarchy: Hierarchy
+    partition: Partition
     level: Ints
     level_face: Ints
     face: Ints
@@ -105,13 +114,18 @@ class Cells:
 
     @property
     def num_cells(self) -> int:
-        """Number of active elements."""
+        """Number of active elements, local, ghosts included."""
         return self.level.size
 
     @property
+    def num_owned(self) -> int:
+        """Number of those that this rank owns."""
+        return self.partition.cells.size_local
+
+    @property
     def num_dofs(self) -> int:
-        """Number of scalar functions."""
-        return self.hierarchy.num_dofs
+        """Number of scalar functions, local, ghosts included."""
+        return self.partition.functions.numbers.size
 
     @property
     def num_pieces(self) -> int:
@@ -221,10 +235,14 @@ class Cells:
             corner: Sub-quad of a polygon, shape (n,).
 
         Returns:
-            Pieces, shape (n,), and coordinates in [0, 1]^2, shape (n, 2).
+            Pieces, -1 where the point lies on a cell that this rank does not hold, shape (n,), and coordinates in
+            [0, 1]^2, shape (n, 2).
         """
+        return self.locate_in_roots(*self.hierarchy.root_position(faces, uv, corner))
+
+    def locate_in_roots(self, face: Ints, uv: Floats) -> tuple[Ints, Floats]:
+        """Return what `locate` does, for points on faces of level 0, shapes (n,) and (n, 2)."""
         hierarchy = self.hierarchy
-        face, uv = hierarchy.root_position(faces, uv, corner)
         piece = np.full(face.size, -1, dtype=np.int32)
         local = np.zeros_like(uv)
         open_points = np.arange(face.size)
@@ -232,9 +250,10 @@ class Cells:
             here = piece_of_face[face]
             done = here >= 0
             piece[open_points[done]], local[open_points[done]] = here[done], uv[done]
-            open_points, face, uv = open_points[~done], face[~done], uv[~done]
-            if stage.step is None or not open_points.size:
+            if stage.step is None:
                 break
+            deeper = ~done & (stage.step.first_child[face] >= 0)  # else it is in a cell that other ranks hold
+            open_points, face, uv = open_points[deeper], face[deeper], uv[deeper]
             child, uv = child_at(uv)
             face = stage.step.first_child[face] + child
         return piece, local
@@ -267,24 +286,36 @@ class _Pieces:
     axes: Floats
 
 
-def extract(hierarchy: Hierarchy) -> Cells:
-    """Return the cells of a hierarchy with the extraction operators of their pieces."""
-    level, level_face, face = _active_elements(hierarchy)
-    pieces = _all_pieces(hierarchy)
+def extract(hierarchy: Hierarchy, parts: Partition | None = None) -> Cells:
+    """Return the cells of a hierarchy with the extraction operators of their pieces.
+
+    Args:
+        hierarchy: The hierarchy.
+        parts: What this rank holds, where it is not what `partition` says: that of a hierarchy with other caps.
+    """
+    parts = partition(hierarchy) if parts is None else parts
+    numbers = parts.cells.numbers
+    level, level_face, face = (of_all[numbers] for of_all in _active_elements(hierarchy))
+    pieces = _all_pieces(hierarchy, parts)
     piece_level = np.repeat(np.arange(len(pieces)), [p.cell.size for p in pieces])
     first_node = np.cumsum([0, *(len(p.points) for p in pieces[:-1])])
     nodes = np.concatenate([first + p.nodes for first, p in zip(first_node, pieces, strict=True)]).astype(np.int32)
+    points = np.concatenate([p.points for p in pieces])
     cell = np.concatenate([p.cell for p in pieces])
     coefficients = sp.csr_array(sp.vstack([part for p in pieces for part in p.coefficients], format="csr"))
+    if not parts.cells.is_whole:
+        nodes, points, coefficients = _without_unused(nodes, points, coefficients)
+        coefficients = _in_local_dofs(coefficients, parts.functions)
     batches, order = _batches(cell, nodes, coefficients)
     place = np.zeros(order.size, dtype=np.int32)
     place[order] = np.arange(order.size, dtype=np.int32)
     return Cells(
         hierarchy=hierarchy,
+        partition=parts,
         level=level,
         level_face=level_face,
         face=face,
-        points=np.concatenate([p.points for p in pieces]),
+        points=points,
         batches=batches,
         piece_origin=np.concatenate([p.origin for p in pieces])[order],
         piece_axes=np.concatenate([p.axes for p in pieces])[order],
@@ -302,6 +333,24 @@ def _scattered(size: int, index: Ints, values: Ints) -> Ints:
     return array
 
 
+def _without_unused(nodes: Ints, points: Floats, coefficients: sp.csr_array) -> tuple[Ints, Floats, sp.csr_array]:
+    """Return nodes numbered anew without those of no piece."""
+    used = np.zeros(len(points), dtype=bool)
+    used[nodes] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return number[nodes], points[used], sp.csr_array(coefficients[np.flatnonzero(used)])
+
+
+def _in_local_dofs(coefficients: sp.csr_array, functions: IndexMap) -> sp.csr_array:
+    """Return coefficients with the columns of the functions that this rank holds, which are all that have entries."""
+    columns = functions.local_of(coefficients.indices)
+    assert (columns >= 0).all()  # or a function that does not vanish on a cell here is missing
+    shape = coefficients.shape[0], functions.numbers.size
+    result = sp.csr_array((coefficients.data, columns, coefficients.indptr), shape=shape)
+    result.sort_indices()
+    return result
+
+
 def _active_elements(hierarchy: Hierarchy) -> tuple[Ints, Ints, Ints]:
     """Return level, face of the level and face of the control mesh of every cell."""
     faces = [stage.active_faces for stage in hierarchy.stages[: hierarchy.num_levels]]
@@ -313,23 +362,33 @@ def _active_elements(hierarchy: Hierarchy) -> tuple[Ints, Ints, Ints]:
     return level, np.concatenate(faces), hierarchy.face_of_root[np.concatenate(root)]
 
 
-def _all_pieces(hierarchy: Hierarchy) -> list[_Pieces]:
+def _all_pieces(hierarchy: Hierarchy, parts: Partition) -> list[_Pieces]:
     """Return the pieces of each stage: active faces that are not cut, and the ends of the cuts."""
     pieces = []
     first_cell = 0
     cell = origin = axes = None
+    numbers = parts.cells.numbers
+    local = _scattered(parts.cells.size_global, numbers, np.arange(numbers.size, dtype=np.int32))
+    coefficients = _all_coefficients(hierarchy, parts, local >= 0)
     for l, stage in enumerate(hierarchy.stages):
         faces = stage.active_faces
         if cell is None or origin is None or axes is None:
             cell, origin, axes = _untouched(stage.level.num_faces)
-        cell[faces] = first_cell + np.arange(faces.size)
+        cell[faces] = local[first_cell : first_cell + faces.size]
         origin[faces], axes[faces] = 0.0, np.eye(2)
         first_cell += faces.size
         at = np.flatnonzero((cell >= 0) & ~stage.cut).astype(np.int32)
-        pieces.append(_pieces(hierarchy, l, at, cell[at], origin[at], axes[at]))
+        pieces.append(_pieces(hierarchy, l, coefficients[l], at, cell[at], origin[at], axes[at]))
         if stage.step is not None:
             cell, origin, axes = _carried_to_children(stage, cell, origin, axes)
     return pieces
+
+
+def _all_coefficients(hierarchy: Hierarchy, parts: Partition, cells: Bools) -> Sequence[sp.csr_array]:
+    """Return the coefficients of the dofs on each stage, as far as the given cells need them."""
+    if parts.cells.is_whole:
+        return hierarchy.coefficients
+    return hierarchy.coefficient_rows(needed_functions(hierarchy, cells))
 
 
 def _untouched(num_faces: int) -> tuple[Ints, Floats, Floats]:
@@ -349,14 +408,16 @@ def _carried_to_children(stage: Stage, cell: Ints, origin: Floats, axes: Floats)
     return carried
 
 
-def _pieces(hierarchy: Hierarchy, l: int, faces: Ints, cell: Ints, origin: Floats, axes: Floats) -> _Pieces:
+def _pieces(
+    hierarchy: Hierarchy, l: int, of_dofs: sp.csr_array, faces: Ints, cell: Ints, origin: Floats, axes: Floats
+) -> _Pieces:
     """Return the pieces that the given faces of stage l are.
 
     Regular interior faces read their 4 x 4 control vertices; all others, caps included, go through the Bezier masks.
     """
     stage = hierarchy.stages[l]
     level, points = stage.level, hierarchy.points[l]
-    coefficients = sp.csr_array(stage.boundary.to_points @ hierarchy.coefficients[l])
+    coefficients = sp.csr_array(stage.boundary.to_points @ of_dofs)
     plain = level.regular & ~level.boundary
     regular = plain[level.quads[faces]].all(axis=1)
     grid = spline_grid(level, faces[regular])
@@ -383,10 +444,10 @@ def _batches(cell: Ints, nodes: Ints, coefficients: sp.csr_array) -> tuple[tuple
     identity, dof = _identity(nodes, coefficients)
     same = np.flatnonzero(identity)
     same = same[np.argsort(cell[same], kind="stable")]
-    batches = []
-    if same.size:
-        batches.append(Batch(cell[same], dof[nodes[same]], np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
     others = np.flatnonzero(~identity).astype(np.int32)
+    batches = []
+    if same.size or not others.size:  # there is always a batch, also on a rank without cells
+        batches.append(Batch(cell[same], dof[nodes[same]], np.arange(same.size + 1, dtype=np.int32), nodes[same], None))
     others = others[np.argsort(cell[others], kind="stable")]
     general, order = _general_batches(cell[others], nodes[others], coefficients, others)
     return (*batches, *general), np.concatenate([same, *order]).astype(np.int32)

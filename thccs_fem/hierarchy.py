@@ -41,7 +41,7 @@ from thccs_fem.mesh import ControlMesh
 from thccs_fem.positions import in_quads, in_sub_quads
 from thccs_fem.subdivision import Bools, Ints, Level, Step, control_level, neighbourhood, subdivide
 
-__all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
+__all__ = ["CAP_LEVEL", "Hierarchy", "Stage", "faces_meeting", "functions_meeting"]
 
 CAP_LEVEL = 4  # level at which the bicubic cap ends the cut at an irregular vertex, unless refinement goes deeper
 
@@ -102,8 +102,15 @@ class Hierarchy:
     stages: tuple[Stage, ...]
 
     @classmethod
-    def on(cls, mesh: ControlMesh, rule: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL) -> Self:
-        """Return the hierarchy of a mesh with nothing refined.
+    def on(
+        cls,
+        mesh: ControlMesh,
+        rule: BoundaryRule = "clamped",
+        *,
+        cap_level: int = CAP_LEVEL,
+        refined_keys: Sequence[Keys] = (),
+    ) -> Self:
+        """Return the hierarchy of a mesh with nothing refined, or with the `refined_keys` of one that was there before.
 
         A mesh with polygons other than quads, or one whose level-0 functions are dependent, is subdivided once.
         """
@@ -111,7 +118,7 @@ class Hierarchy:
         root = control_level(mesh)
         if not root.is_quad or _is_dependent(root):
             root = _as_level_zero(subdivide(root, np.ones(root.num_faces, dtype=bool)).fine)
-        return cls._build(mesh, rule, cap_level, (), root)
+        return cls._build(mesh, rule, cap_level, refined_keys, root)
 
     @classmethod
     def _build(
@@ -181,6 +188,14 @@ class Hierarchy:
         """C_l for every stage, shape (functions of the level, num_dofs)."""
         return tuple(_coefficients(self.stages, self.stages))
 
+    def coefficient_rows(self, needed: Sequence[Bools]) -> list[sp.csr_array]:
+        """Return `coefficients` with those rows alone that are marked, stage by stage; others are empty.
+
+        Args:
+            needed: Marks of functions for each stage; rows that marked ones are made of must be marked as well.
+        """
+        return _coefficients(self.stages, self.stages, needed)
+
     def support(self, dofs: npt.NDArray[np.integer]) -> tuple[Bools, ...]:
         """Return, for each level, the faces in the support of those given dofs that belong to the level."""
         marked = np.zeros(self.num_dofs, dtype=bool)
@@ -189,7 +204,7 @@ class Hierarchy:
         for l, stage in enumerate(self.stages[: self.num_levels]):
             functions = stage.active.copy()
             functions[stage.active] = marked[self.dof_offsets[l] : self.dof_offsets[l + 1]]
-            supports.append(_support(stage.boundary, functions))
+            supports.append(faces_meeting(stage.boundary, functions))
         return tuple(supports)
 
     def refined(self, dofs: npt.NDArray[np.integer]) -> Self:
@@ -373,8 +388,8 @@ def _stages(root: Level, rule: BoundaryRule, refined_keys: Sequence[Keys], caps:
         keys = refined_keys[level.number] if level.number < len(refined_keys) else np.zeros(0, dtype=np.int64)
         refined = np.isin(level.keys, keys, assume_unique=True) & inside
         cut = held & ~refined & _needs_cut(level, caps)
-        selected = ~_meeting(boundary, ~inside)
-        active = selected & _meeting(boundary, ~refined)
+        selected = ~functions_meeting(boundary, ~inside)
+        active = selected & functions_meeting(boundary, ~refined)
         opened = refined | cut
         if not opened.any():
             stages.append(Stage(level, boundary, inside, refined, cut, None, None, selected, active))
@@ -408,7 +423,7 @@ def _dof_step(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_array:
     return sp.csr_array(to_dofs(fine) @ subdivision_matrix(coarse, fine, step) @ coarse.to_points)
 
 
-def _meeting(boundary: Boundary, faces: Bools) -> Bools:
+def functions_meeting(boundary: Boundary, faces: Bools) -> Bools:
     """Return the functions whose support meets the marked faces, shape (num_functions,).
 
     The support of a vertex's function are the faces that touch a face of the vertex; that of a trace is smaller.
@@ -418,7 +433,7 @@ def _meeting(boundary: Boundary, faces: Bools) -> Bools:
     return np.concatenate([vertices, traces_meeting(boundary, faces)])
 
 
-def _support(boundary: Boundary, functions: Bools) -> Bools:
+def faces_meeting(boundary: Boundary, functions: Bools) -> Bools:
     """Return the faces in the union of the supports of the marked functions, shape (num_faces,)."""
     level = boundary.level
     vertices, traces = np.split(functions, [level.num_vertices])
@@ -444,18 +459,18 @@ def _cover(stage: Stage, wanted: Bools, kept: Bools, most: Bools) -> Bools:
     if np.array_equal(kept, most):  # refinement alone
         return most
     boundary = stage.boundary
-    covered = _support(boundary, stage.selected & ~_meeting(boundary, ~kept))
+    covered = faces_meeting(boundary, stage.selected & ~functions_meeting(boundary, ~kept))
     left = wanted & ~covered
     if not left.any():
         return covered
-    candidates = stage.selected & ~_meeting(boundary, ~most)
+    candidates = stage.selected & ~functions_meeting(boundary, ~most)
     vertices, traces = np.split(candidates, [stage.level.num_vertices])
     chosen = np.zeros(boundary.num_functions, dtype=bool)
     chosen[_cheapest(stage.level, np.flatnonzero(vertices), left, ~kept & ~covered)] = True
-    covered = covered | _support(boundary, chosen)
+    covered = covered | faces_meeting(boundary, chosen)
     left = left & ~covered
     chosen[stage.level.num_vertices :] = traces & traces_meeting(boundary, left)
-    return covered | _support(boundary, chosen)
+    return covered | faces_meeting(boundary, chosen)
 
 
 def _cheapest(level: Level, vertices: npt.NDArray[np.integer], left: Bools, unwanted: Bools) -> Ints:
@@ -483,10 +498,13 @@ def _cheapest(level: Level, vertices: npt.NDArray[np.integer], left: Bools, unwa
     return np.unique(vertices[order[best[left & (best < order.size)]]]).astype(np.int32)
 
 
-def _coefficients(stages: Sequence[Stage], of: Sequence[Stage]) -> list[sp.csr_array]:
+def _coefficients(
+    stages: Sequence[Stage], of: Sequence[Stage], needed: Sequence[Bools] | None = None
+) -> list[sp.csr_array]:
     """Return, on each of the given stages, the coefficients of the dofs of the hierarchy `of`.
 
     `of` is the stages' own hierarchy, or a coarser one: then its functions are found on the larger levels by face keys.
+    Rows that are not needed are left empty.
     """
     num_dofs = sum(int(np.count_nonzero(stage.active)) for stage in of)
     result: list[sp.csr_array] = []
@@ -496,13 +514,15 @@ def _coefficients(stages: Sequence[Stage], of: Sequence[Stage]) -> list[sp.csr_a
         selected, active = _functions_on(stage, of[l]) if l < len(of) else (np.zeros(0, dtype=np.int32),) * 2
         columns = first + np.arange(active.size)
         first += active.size
+        if needed is not None:
+            active, columns = active[needed[l][active]], columns[needed[l][active]]
         unit = sp.csr_array((np.ones(active.size), (active, columns)), shape=(size, num_dofs))
         if l == 0:
             result.append(unit)
             continue
         matrix = stages[l - 1].matrix
         assert matrix is not None  # every stage but the last has a step
-        kept = np.ones(size)
+        kept = np.ones(size) if needed is None else needed[l].astype(np.float64)
         kept[selected] = 0.0  # the truncation
         result.append(sp.csr_array(sp.diags_array(kept, format="csr") @ (matrix @ result[-1]) + unit))
         result[-1].eliminate_zeros()

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thccs_fem import mesh
+from thccs_fem.parallel import by_first_rank
 from thccs_fem.polygons import Pair
 from thccs_fem.vtk import write_vtu
 
@@ -79,12 +80,12 @@ def read_mesh(
 
     Warns:
         UserWarning: As `thccs_fem.mesh.ControlMesh`; or some tagged lines are no edges of the
-            surface; or meshio had something to say.
+            surface; or meshio had something to say. On rank 0 alone.
     """
     if gdim not in (None, 2, 3):
         raise ValueError(f"gdim is {gdim!r}; expected 2, 3 or None")
     file = Path(path)
-    surface = _from_first_rank(comm, lambda: _read(file))
+    surface = by_first_rank(comm, lambda: _read(file))
     vertices = _in_its_dimension(file, surface.vertices, gdim)
     try:
         faces = mesh.orient(vertices, surface.faces) if orient else surface.faces
@@ -92,24 +93,6 @@ def read_mesh(
     except ValueError as error:
         repair = " (or read_mesh with orient=True)" if "mesh.orient" in str(error) else ""
         raise ValueError(f"{file}: {error}{repair}") from error
-
-
-def _from_first_rank[T](comm: Any, read: Callable[[], T]) -> T:
-    """Call on rank 0, and return or raise on every rank what that returned or raised. Collective."""
-    if comm is None or comm.size == 1:
-        return read()
-    result: T | None = None
-    raised: Exception | None = None
-    if comm.rank == 0:
-        try:
-            result = read()
-        except Exception as error:  # of any kind: the other ranks wait for it
-            raised = error
-    result, raised = comm.bcast((result, raised), root=0)
-    if raised is not None:
-        raise raised
-    assert result is not None  # rank 0 has returned it
-    return result
 
 
 def _read(path: Path) -> _Surface:

@@ -249,18 +249,23 @@ INLINE void add_extracted(int local, int32_t rows, int32_t columns, int32_t widt
 
 /* Where the entries of a cell's tensor go: see thccs_assemble_matrix. */
 typedef struct {
+  int32_t num_rows;
   const int32_t *indptr;
   const void *positions;
   int32_t position_size;
 } target;
 
-/* values += tensor (width, rows, width, columns), of which the first n functions are used. */
+/* values += tensor (width, rows, width, columns), of which the first n functions are used; only those with a row. */
 INLINE void add_rows(int32_t n, int32_t width, const int32_t *dofs, int32_t rows, int32_t columns, target into,
                      const double *restrict tensor, double *restrict values)
 {
   const uint8_t *narrow = into.positions;
   const uint16_t *wide = into.positions;
   for (int32_t a = 0; a < n; ++a, narrow += n, wide += n) {
+    if (dofs[a] >= into.num_rows) {
+      tensor += rows * width * columns;
+      continue;
+    }
     const int64_t begin = into.indptr[dofs[a]], length = into.indptr[dofs[a] + 1] - begin;
     for (int32_t r = 0; r < rows; ++r, tensor += width * columns) {
       double *row = values + (begin * rows + r * length) * columns;
@@ -274,7 +279,7 @@ INLINE void add_rows(int32_t n, int32_t width, const int32_t *dofs, int32_t rows
 }
 
 INLINE int assemble_matrix(int sides, const thccs_batch *batch, const thccs_integral *integral, int32_t rows,
-                           int32_t columns, const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                           int32_t columns, int32_t num_rows, const int32_t *indptr, const int64_t *starts, int32_t position_size,
                            const void *positions, double *values)
 {
   workspace work;
@@ -297,8 +302,8 @@ INLINE int assemble_matrix(int sides, const thccs_batch *batch, const thccs_inte
     int32_t n = 0;
     while (n < width && dofs[n] >= 0)
       ++n;
-    const target into = {indptr, (const char *)positions + starts[k] * position_size, position_size};
-    const target usual = {indptr, into.positions, 1};
+    const target into = {num_rows, indptr, (const char *)positions + starts[k] * position_size, position_size};
+    const target usual = {num_rows, indptr, into.positions, 1};
     if (position_size == 1 && components == 1)
       add_rows(n, width, dofs, 1, 1, usual, tensor, values);
     else if (position_size == 1 && columns == 2)
@@ -313,12 +318,13 @@ INLINE int assemble_matrix(int sides, const thccs_batch *batch, const thccs_inte
 }
 
 int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
-                          const int32_t *indptr, const int64_t *starts, int32_t position_size,
+                          int32_t num_rows, const int32_t *indptr, const int64_t *starts, int32_t position_size,
                           const void *positions, double *values)
 {
-  return batch->sides == 1
-             ? assemble_matrix(1, batch, integral, rows, columns, indptr, starts, position_size, positions, values)
-             : assemble_matrix(2, batch, integral, rows, columns, indptr, starts, position_size, positions, values);
+  return batch->sides == 1 ? assemble_matrix(1, batch, integral, rows, columns, num_rows, indptr, starts, position_size,
+                                             positions, values)
+                           : assemble_matrix(2, batch, integral, rows, columns, num_rows, indptr, starts, position_size,
+                                             positions, values);
 }
 
 /* ---- Local problems -------------------------------------------------------------------------------------------- */

@@ -49,7 +49,7 @@ int thccs_assemble_vector(const thccs_batch *batch, const thccs_integral *integr
    pattern with dense blocks of rows x columns components. The k-th cell of the batch has n dofs; entry (a, b) of its
    tensor belongs positions[starts[k] + n a + b] entries after the beginning of its row. position_size is 1 (uint8)
    or 2 (uint16). */
-int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns,
+int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integral, int32_t rows, int32_t columns, int32_t num_rows,
                           const int32_t *indptr, const int64_t *starts, int32_t position_size,
                           const void *positions, double *values);
 

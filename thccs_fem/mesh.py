@@ -8,6 +8,7 @@ Orders: vertices and faces are the user's; edges are pairs (smaller vertex, larg
 lexicographic order; the two faces of an edge are in ascending order.
 """
 
+import hashlib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from scipy.spatial import KDTree
 import ufl
 from thccs_fem import element
 from thccs_fem.absent import Absent
+from thccs_fem.parallel import end_together, rank_of, size_of, together
 from thccs_fem.polygons import (
     Bools,
     Faces,
@@ -81,8 +83,8 @@ class ControlMesh:
         edge_tags: Integers of some edges, ``{(i, j): tag}`` with i and j in any order.
         creases: Sharpness of some edges, ``{(i, j): sharpness}``; 10 and more is infinite.
         corners: Sharpness of some vertices, ``{i: sharpness}``; 10 and more is infinite.
-        comm: MPI communicator of the ranks that work on the mesh, each of which holds the whole of
-            it; None in serial.
+        comm: MPI communicator of the ranks that work on the mesh, one of mpi4py; None in serial. Each
+            rank gives the whole mesh, the same as the others. Collective.
 
     Attributes:
         vertices: Coordinates, shape (num_vertices, gdim), float64.
@@ -105,10 +107,10 @@ class ControlMesh:
         TypeError: Vertices, faces, tags or sharpnesses are not of the type above.
         ValueError: A shape, an index or a coordinate is wrong; the faces are no oriented manifold;
             a face has no area, crosses itself or is clockwise in the plane; or a tag or a sharpness
-            is for an edge or a vertex that is not there.
+            is for an edge or a vertex that is not there; or ranks give different meshes.
 
     Warns:
-        UserWarning: Boundary vertices coincide: the mesh has a crack.
+        UserWarning: Boundary vertices coincide: the mesh has a crack. On rank 0 alone.
 
     >>> points = [(0, 0), (1, 0), (1, 1), (0, 1)]
     >>> square = ControlMesh(points, [(0, 1, 2, 3)], edge_tags={(1, 0): 7})
@@ -140,6 +142,23 @@ class ControlMesh:
         corners: Mapping[int, float] | None = None,
         comm: Any = None,
     ) -> None:
+        if not (comm is None or hasattr(comm, "allgather")):
+            raise TypeError(f"comm is {comm!r}; expected a communicator of mpi4py, such as MPI.COMM_WORLD, or None")
+        self._set(comm=comm)
+        end_together(comm)
+        together(comm, lambda: self._make(vertices, faces, face_tags, edge_tags, creases, corners))
+        self._check_that_ranks_agree()
+
+    def _make(
+        self,
+        vertices: npt.ArrayLike,
+        faces: Faces,
+        face_tags: npt.ArrayLike | None,
+        edge_tags: Mapping[Pair, int] | None,
+        creases: Mapping[Pair, float] | None,
+        corners: Mapping[int, float] | None,
+    ) -> None:
+        """Check what is given, and keep it."""
         points = vertex_array(vertices)
         polygons = read_polygons(faces, len(points))
         check_faces(polygons)
@@ -155,7 +174,6 @@ class ControlMesh:
             face_tags=face_tag_array(face_tags, polygons.num_faces),
             edges=polygons.edges,
             edge_faces=polygons.edge_faces,
-            comm=comm,
         )
         self._set(
             edge_tags=self._on_edges("edge_tags", edge_tags, as_tag),
@@ -164,7 +182,33 @@ class ControlMesh:
         )
         if self.gdim == 2:
             self._check_counter_clockwise(face_areas(points[polygons.vertices], polygons)[:, 0])
-        self._warn_of_cracks()
+        if rank_of(self.comm) == 0:
+            self._warn_of_cracks()
+
+    def _check_that_ranks_agree(self) -> None:
+        """Raise ValueError unless the mesh is the same on all ranks. Collective."""
+        if size_of(self.comm) == 1:
+            return
+        first, *others = self.comm.allgather(self._digests())
+        for rank, digests in enumerate(others, start=1):
+            names = [name for name, digest in digests.items() if digest != first[name]]
+            if names:
+                raise ValueError(
+                    f"rank {rank} of {self.comm.size} gives a mesh with other {', '.join(names)} than rank 0; expected "
+                    f"the whole mesh, the same on all ranks. io.read_mesh(path, comm) reads a file on rank 0 for all"
+                )
+
+    def _digests(self) -> dict[str, str]:
+        """Return what differs if an argument differs, by the name of the argument."""
+        given = {
+            "vertices": bytes([self.gdim]) + self.vertices.tobytes(),
+            "faces": self.face_offsets.tobytes() + self.face_vertices.tobytes(),
+            "face_tags": self.face_tags.tobytes(),
+            "edge_tags": repr(sorted(self.edge_tags.items())).encode(),
+            "creases": repr(sorted(self.creases.items())).encode(),
+            "corners": repr(sorted(self.corners.items())).encode(),
+        }
+        return {name: hashlib.sha256(data).hexdigest() for name, data in given.items()}
 
     geometry = Absent(
         "msh.vertices are the control points, msh.gdim their dimension; limit.evaluate has points of the surface"

@@ -28,6 +28,7 @@ import numpy.typing as npt
 from thccs_fem import element
 from thccs_fem.extraction import Batch, Cells, extract
 from thccs_fem.hierarchy import Hierarchy
+from thccs_fem.partition import partition
 from thccs_fem.subdivision import Bools
 
 __all__ = ["paper_cells", "without_caps"]
@@ -47,7 +48,8 @@ def paper_cells(hierarchy: Hierarchy) -> Cells:
     Args:
         hierarchy: The hierarchy.
     """
-    cells = extract(hierarchy.with_caps_at(max(hierarchy.cap_level, hierarchy.num_levels - 1 + DEPTH)))
+    deep = hierarchy.with_caps_at(max(hierarchy.cap_level, hierarchy.num_levels - 1 + DEPTH))
+    cells = extract(deep, partition(hierarchy))
     first = np.cumsum([0, *(batch.num_pieces for batch in cells.batches)])
     batches: list[Batch] = []
     pieces, points, corners, sides = [], [], [], []
@@ -122,7 +124,7 @@ def without_caps(depth: int) -> Callable[[Hierarchy], Cells]:
 
 
 def _capless_cells(hierarchy: Hierarchy, depth: int) -> Cells:
-    cells = extract(hierarchy.with_caps_at(depth))
+    cells = extract(hierarchy.with_caps_at(depth), partition(hierarchy))
     kept = ~_caps(cells)
     number = np.where(kept, np.cumsum(kept) - 1, -1).astype(np.int32)
     of_batches = np.split(kept, np.cumsum([batch.num_pieces for batch in cells.batches])[:-1])

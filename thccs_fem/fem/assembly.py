@@ -30,7 +30,7 @@ Ints = npt.NDArray[np.int32]
 
 
 def assemble_scalar(form: Form, /) -> float:
-    """Return the value of a form without arguments (of this rank's cells, in parallel).
+    """Return the value of a form without arguments, of this rank's cells: the sum over ranks is that of the form.
 
     Raises:
         ValueError: The form has arguments.
@@ -39,7 +39,7 @@ def assemble_scalar(form: Form, /) -> float:
 
 
 def assemble_cells(form: Form, /) -> Floats:
-    """Return the integrals of a form without arguments over each cell, shape (num_cells,).
+    """Return the integrals of a form without arguments over each cell that this rank owns, shape (cells.num_owned,).
 
     An integral over a facet on the boundary counts for its cell, one over a facet between cells for both, by half.
 
@@ -50,11 +50,13 @@ def assemble_cells(form: Form, /) -> Floats:
     values = np.zeros(form.cells.num_cells)
     for loop in loops(form):
         loop.run(library().lib.thccs_assemble_cells, pointer(values))
-    return values
+    return values[: form.cells.num_owned]
 
 
 def assemble_vector(form: Form, /) -> Floats:
-    """Return the vector of a form with a test function, shape (num_dofs of its space,).
+    """Return the vector of a form with a test function, shape (num_local_dofs of its space,).
+
+    The part of dofs that this rank owns is complete, without communication; entries of ghosts have no meaning.
 
     Raises:
         ValueError: The form has not exactly one argument.
@@ -65,7 +67,7 @@ def assemble_vector(form: Form, /) -> Floats:
     for loop in loops(form):
         loop.run(library().lib.thccs_assemble_vector, test.block_size, pointer(values))
     transfer = form.transfers.get(test.hierarchy)
-    return (values if transfer is None else transfer.T @ values).ravel()
+    return (values if transfer is None else transfer.transposed(values)).ravel()
 
 
 @overload
@@ -84,7 +86,8 @@ def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /)
     writes ``A.data`` in place: who shares its memory sees the new values.
 
     Returns:
-        Shape (num_dofs of the test space, num_dofs of the trial space).
+        Rows of the dofs that this rank owns, columns of those that it holds: shape (num_owned_dofs of the test space,
+        num_local_dofs of the trial space).
 
     Raises:
         ValueError: The form has not exactly two arguments; the matrix to be refilled was not assembled from a form with
@@ -97,8 +100,14 @@ def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /)
 
 
 def integrals(V: FunctionSpace) -> Floats:
-    """Return the integral of each scalar function of V, as `form` integrates if nothing is said, (num_functions,)."""
-    return assemble_vector(compile_form(ufl.TestFunction(FunctionSpace(V.hierarchy, (), V.integration)) * ufl.dx))
+    """Return the integral of each scalar function of V, as `form` integrates if nothing is said.
+
+    Returns:
+        Shape (functions,), local, ghosts included.
+    """
+    values = assemble_vector(compile_form(ufl.TestFunction(FunctionSpace(V.hierarchy, (), V.integration)) * ufl.dx))
+    V.index_map.scatter_forward(values)
+    return values
 
 
 def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
@@ -113,7 +122,7 @@ def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
         u: Function in the space of all arguments, on whose cells both forms are integrated.
 
     Returns:
-        Shape (num_cells,): infinite where K is singular and the equations for K^-1 r have no solution.
+        Shape (cells.num_owned,): infinite where K is singular and the equations for K^-1 r have no solution.
     """
     cells, block_size = a.cells, u.function_space.block_size
     size = 4 * block_size
@@ -126,7 +135,7 @@ def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
             loop.run(library().lib.thccs_assemble_on_bubbles, block_size, *of_pieces, local, pointer(K), pointer(r))
     energies = np.zeros(cells.num_cells)
     library().lib.thccs_solve_local(energies.size, size, *(pointer(array) for array in (K, r, r.copy(), energies)))
-    return energies
+    return energies[: cells.num_owned]
 
 
 def _check_rank(form: Form, rank: int) -> None:
@@ -142,7 +151,7 @@ def _new_matrix(form: Form) -> sp.csr_array:
     indptr, indices = _structure(form)
     values = np.zeros(indices.size)
     _add_matrix(form, values)
-    shape = tuple(form.cells.num_dofs * space.block_size for space in form.spaces)
+    shape = indptr.size - 1, form.cells.num_dofs * form.spaces[1].block_size
     A = sp.csr_array((values, indices, indptr), shape=shape)
     test, trial = (_blocked_transfer(form, space) for space in form.spaces)
     return A if test is None and trial is None else _carried(A, test, trial)
@@ -198,6 +207,7 @@ def _add_matrix(form: Form, values: Floats) -> None:
         loop.run(
             library().lib.thccs_assemble_matrix,
             *block_sizes,
+            scalar.indptr.size - 1,
             pointer(scalar.indptr),
             pointer(scalar.starts[loop.sets]),
             scalar.positions.itemsize,

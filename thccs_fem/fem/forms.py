@@ -12,8 +12,6 @@ from functools import cached_property
 from types import ModuleType
 from typing import Any, overload
 
-import scipy.sparse as sp
-
 import ufl
 from thccs_fem import element, jit
 from thccs_fem.extraction import Cells, extract
@@ -30,6 +28,7 @@ from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, functionspace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.prolongation import Prolongation
 from ufl.algorithms.estimate_degrees import SumDegreeEstimator
 from ufl.corealg.map_dag import map_expr_dags
 
@@ -69,7 +68,7 @@ class Form:
         integrals: What is summed.
         hierarchy: The finest hierarchy, whose cells are integrated on.
         cells: These cells.
-        transfers: For each coarser hierarchy the matrix that carries its scalar functions to `hierarchy`.
+        transfers: For each coarser hierarchy what carries its scalar functions to `hierarchy`.
         module: The compiled module, kept while its kernels are.
     """
 
@@ -80,7 +79,7 @@ class Form:
     integrals: tuple[Integral, ...]
     hierarchy: Hierarchy
     cells: Cells
-    transfers: Mapping[Hierarchy, sp.csr_array]
+    transfers: Mapping[Hierarchy, Prolongation]
     module: ModuleType
 
     @property
@@ -192,11 +191,11 @@ def _finest(spaces: Sequence[Space]) -> Space:
     )
 
 
-def _transfers(finest: Hierarchy, spaces: Sequence[Space]) -> dict[Hierarchy, sp.csr_array]:
+def _transfers(finest: Hierarchy, spaces: Sequence[Space]) -> dict[Hierarchy, Prolongation]:
     """Return the prolongations of scalar functions from all hierarchies that differ from the finest."""
     hierarchies = dict.fromkeys(space.hierarchy for space in spaces if isinstance(space, FunctionSpace))
     return {
-        coarse: finest.prolongation(coarse)
+        coarse: Prolongation(finest, coarse)
         for coarse in hierarchies
         if not (coarse is finest or coarse.same_as(finest))
     }

@@ -10,9 +10,13 @@ import numpy.typing as npt
 import ufl
 from thccs_fem.absent import Absent
 from thccs_fem.element import NUM_FUNCTIONS
-from thccs_fem.extraction import evaluate_pieces
+from thccs_fem.extraction import Cells, evaluate_pieces
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, cellwise
+from thccs_fem.index_map import Fetch, IndexMap
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.parallel import gathered, rank_of, size_of, together, total
+from thccs_fem.prolongation import Prolongation
+from thccs_fem.subdivision import Ints
 
 __all__ = ["Constant", "Function", "Vector", "cell_sizes"]
 
@@ -20,24 +24,42 @@ NUM_GAUSS = 4  # points in each direction for areas
 
 
 class Vector:
-    """Coefficients of a function; `array` holds those this rank owns, then its ghosts (none in serial)."""
+    """Coefficients of a function; `array` holds those this rank owns, then its ghosts (none in serial).
 
-    def __init__(self, size: int):
-        self._array = np.zeros(size)
+    Args:
+        index_map: What this rank owns and holds.
+        block_size: Coefficients of each.
+    """
+
+    def __init__(self, index_map: IndexMap, block_size: int):
+        self._index_map = index_map
+        self._block_size = block_size
+        self._array = np.zeros(block_size * index_map.numbers.size)
 
     @property
     def array(self) -> npt.NDArray[np.float64]:
-        """Values, shape (num_dofs,), float64; write into it or assign to it."""
+        """Values, shape (block_size * (size_local + num_ghosts),), float64; write into it or assign to it."""
         return self._array
 
     @array.setter
     def array(self, values: npt.ArrayLike) -> None:
         self._array[:] = values
 
+    @property
+    def index_map(self) -> IndexMap:
+        """What this rank owns and holds, without the block size."""
+        return self._index_map
+
+    @property
+    def block_size(self) -> int:
+        """Coefficients of each index of the map."""
+        return self._block_size
+
     petsc_vec = Absent("PETSc.Vec().createWithArray(u.x.array) is one that shares the values")
 
     def scatter_forward(self) -> None:
-        """Update the ghosts, of which there are none in serial: nothing happens."""
+        """Give ghosts the values that their owners have; collective."""
+        self._index_map.scatter_forward(self._array.reshape(-1, self._block_size))
 
 
 class Function(ufl.Coefficient):
@@ -53,7 +75,7 @@ class Function(ufl.Coefficient):
             raise TypeError(f"a Function needs a space from fem.functionspace, got {type(V).__name__}")
         super().__init__(V)  # type: ignore[no-untyped-call]  # UFL is typed in part
         self.name = name
-        self._x = Vector(V.num_dofs)
+        self._x = Vector(V.index_map, V.block_size)
 
     @property
     def function_space(self) -> FunctionSpace:
@@ -80,30 +102,49 @@ class Function(ufl.Coefficient):
         return other
 
     def local_coefficients(self, V: FunctionSpace | CellwiseSpace | None = None) -> npt.NDArray[np.float64]:
-        """Return the local B-spline coefficients on each piece of a space.
+        """Return the local B-spline coefficients on each piece of a space; collective.
 
         Args:
             V: A refinement of the function's space; None: that space.
 
         Returns:
-            Shape (num_pieces, 16, block_size).
+            Shape (num_pieces, 16, block_size), local.
 
         Raises:
             ValueError: If V is no refinement.
         """
         own = self.ufl_function_space()
-        values = self.x.array.reshape(-1, own.block_size)
         cells = own.cells if V is None else V.cells
         if isinstance(own, CellwiseSpace):  # the local functions add up to one
-            return np.repeat(values[own.dofs_of(cells)[cells.piece_cell], None], NUM_FUNCTIONS, axis=1)
+            return np.repeat(self.cell_values(cells)[cells.piece_cell, None], NUM_FUNCTIONS, axis=1)
+        values = self.x.array.reshape(-1, own.block_size)
         if cells.hierarchy is not own.hierarchy:
-            values = cells.hierarchy.prolongation(own.hierarchy) @ values
+            values = Prolongation(cells.hierarchy, own.hierarchy)(values)
         return cells.local(values)
+
+    def cell_values(self, cells: Cells) -> npt.NDArray[np.float64]:
+        """Return the values of a function that is constant on each cell, on finer cells or the same; collective.
+
+        Returns:
+            Shape (cells.num_cells, block_size), local.
+
+        Raises:
+            ValueError: If some are coarser.
+        """
+        V = self.ufl_function_space()
+        assert isinstance(V, CellwiseSpace)  # callers look first
+        values = self.x.array.reshape(-1, V.block_size)
+        if cells.hierarchy is V.hierarchy:
+            return values
+        numbers = together(V.mesh.comm, lambda: V.numbers_of(cells))
+        return Fetch(V.index_map, numbers)(values)
 
     def eval(
         self, faces: npt.ArrayLike, uv: npt.ArrayLike, corner: npt.ArrayLike | None = None
     ) -> npt.NDArray[np.float64]:
-        """Evaluate at points given on faces of the control mesh.
+        """Evaluate at points given on faces of the control mesh; collective.
+
+        On several ranks each gets the values at the points that it gave, wherever these lie.
 
         Args:
             faces: Faces, shape (n,).
@@ -117,12 +158,26 @@ class Function(ufl.Coefficient):
             ValueError: If a face, coordinate or corner is out of range.
         """
         V = self.ufl_function_space()
-        piece, position = V.cells.locate(faces, uv, corner)
-        if isinstance(V, CellwiseSpace):
-            values = self.x.array.reshape(-1, V.block_size)[V.dofs_of(V.cells)[V.cells.piece_cell[piece]]]
-        else:
-            values = evaluate_pieces(self.local_coefficients(), piece, position)
+        comm = V.mesh.comm
+        face, position = together(comm, lambda: V.cells.hierarchy.root_position(faces, uv, corner))
+        values = self._at(gathered(comm, face), gathered(comm, position))
+        if size_of(comm) > 1:
+            begin = sum(comm.allgather(face.size)[: rank_of(comm)])
+            values = total(comm, values)[begin : begin + face.size]
         return values if V.value_shape else values[:, 0]
+
+    def _at(self, face: Ints, position: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return the values at points of faces of level 0, shape (n, block_size); zero on cells of other ranks."""
+        V = self.ufl_function_space()
+        piece, position = V.cells.locate_in_roots(face, position)
+        here = np.flatnonzero(piece >= 0)
+        here = here[V.cells.piece_cell[piece[here]] < V.cells.num_owned]
+        values = np.zeros((face.size, V.block_size))
+        if isinstance(V, CellwiseSpace):
+            values[here] = self.cell_values(V.cells)[V.cells.piece_cell[piece[here]]]
+        else:
+            values[here] = evaluate_pieces(self.local_coefficients(), piece[here], position[here])
+        return values
 
     def __str__(self) -> str:
         return self.name

@@ -165,8 +165,8 @@ def _values(form: Form, i: int) -> tuple[Floats, bool]:
     """Return the values of a coefficient on the cells that are integrated on; see `_Data`."""
     function = form.coefficients[i]
     space = function.ufl_function_space()
-    values = function.x.array.reshape(-1, space.block_size)
     if isinstance(space, CellwiseSpace):
-        return values[space.dofs_of(form.cells)], True
+        return function.cell_values(form.cells), True
+    values = function.x.array.reshape(-1, space.block_size)
     transfer = form.transfers.get(space.hierarchy)
-    return values if transfer is None else transfer @ values, False
+    return values if transfer is None else transfer(values), False

@@ -201,7 +201,7 @@ def _mean(density: ufl.core.expr.Expr, V: CellwiseSpace) -> Floats:
 def _means(V: CellwiseSpace, cells: Cells, of_cells: npt.NDArray[np.integer], integrals: Floats) -> Floats:
     """Return sums of integrals over given cells, or parts of them, divided by the area of the face or cell of V."""
     _check_finite(integrals)
-    number = V.dofs_of(cells)
+    number = V.numbers_of(cells)
     areas = _quadrature(cells)[2].sum(axis=1)
     sums, area = (
         np.bincount(number[part], weights=weights, minlength=V.num_cells)

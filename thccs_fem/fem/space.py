@@ -23,7 +23,10 @@ from thccs_fem.boundary import BoundaryRule, to_dofs
 from thccs_fem.extraction import Cells, extract
 from thccs_fem.folds import check_no_folds
 from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
+from thccs_fem.index_map import IndexMap
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.parallel import together
+from thccs_fem.partition import partition
 from thccs_fem.subdivision import Ints
 
 __all__ = ["CellwiseSpace", "Component", "FunctionSpace", "cellwise", "check_space", "functionspace"]
@@ -74,6 +77,11 @@ class FunctionSpace(ufl.FunctionSpace):
         return self.hierarchy.mesh
 
     @property
+    def index_map(self) -> IndexMap:
+        """Which scalar functions this rank owns, and of which it holds copies."""
+        return partition(self.hierarchy).functions
+
+    @property
     def num_functions(self) -> int:
         """Number of scalar functions, global."""
         return self.hierarchy.num_dofs
@@ -84,9 +92,19 @@ class FunctionSpace(ufl.FunctionSpace):
         return self.block_size * self.num_functions
 
     @property
+    def num_owned_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns."""
+        return self.block_size * self.index_map.size_local
+
+    @property
+    def num_local_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns or has as ghosts."""
+        return self.block_size * self.index_map.numbers.size
+
+    @property
     def num_cells(self) -> int:
         """Number of active elements, global."""
-        return self.cells.num_cells
+        return partition(self.hierarchy).cells.size_global
 
     @property
     def num_levels(self) -> int:
@@ -105,7 +123,7 @@ class FunctionSpace(ufl.FunctionSpace):
 
     @cached_property
     def reference_points(self) -> npt.NDArray[np.float64]:
-        """A point for each function, shape (num_functions, gdim).
+        """A point for each function, shape (num_functions, gdim), local, ghosts included.
 
         The limit point of the function's vertex; on a clamped boundary a trace function sits at the rim vertex, the one
         beside it a third of an edge inside.
@@ -117,7 +135,7 @@ class FunctionSpace(ufl.FunctionSpace):
             limit = np.zeros((boundary.num_functions, self.mesh.gdim))
             limit[: boundary.level.num_vertices] = _limit_points(hierarchy, l)
             points.append((to_dofs(boundary) @ limit)[hierarchy.dof_functions(l)])
-        return np.concatenate(points)
+        return np.concatenate(points)[self.index_map.numbers]
 
     def sub(self, component: int) -> Component:
         """Return one component, for boundary conditions on it alone.
@@ -194,6 +212,8 @@ class CellwiseSpace(ufl.FunctionSpace):
     Make one with ``functionspace(msh, ("DG", 0))`` or with `cellwise`. Degree of freedom `block_size * i + c` is
     component c on face or cell i. What is finer than these has the value of the face or cell it lies in.
 
+    On several ranks cells are spread as those of the space are; faces of the control mesh are held by all, as the mesh.
+
     Args:
         mesh: The control mesh.
         hierarchy: The hierarchy with the cells; None: the faces of the mesh.
@@ -208,15 +228,30 @@ class CellwiseSpace(ufl.FunctionSpace):
         self.hierarchy = hierarchy
         self.block_size = int(np.prod(value_shape, dtype=int))
 
+    @cached_property
+    def index_map(self) -> IndexMap:
+        """Which cells this rank owns, and of which it holds copies; every rank holds all faces of the control mesh."""
+        return IndexMap.whole(self.mesh.num_faces) if self.hierarchy is None else partition(self.hierarchy).cells
+
     @property
     def num_cells(self) -> int:
         """Number of faces or cells, global."""
-        return self.mesh.num_faces if self.hierarchy is None else self.cells.num_cells
+        return self.index_map.size_global
 
     @property
     def num_dofs(self) -> int:
         """Number of degrees of freedom, block_size for each face or cell, global."""
         return self.block_size * self.num_cells
+
+    @property
+    def num_owned_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns."""
+        return self.block_size * self.index_map.size_local
+
+    @property
+    def num_local_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns or has as ghosts."""
+        return self.block_size * self.index_map.numbers.size
 
     @cached_property
     def cells(self) -> Cells:
@@ -234,7 +269,7 @@ class CellwiseSpace(ufl.FunctionSpace):
             return isinstance(other, CellwiseSpace) and other.hierarchy is None and other.mesh is self.mesh
         return other.integration is extract and FunctionSpace(self.hierarchy).is_refinement_of(other)
 
-    def dofs_of(self, cells: Cells) -> Ints:
+    def numbers_of(self, cells: Cells) -> Ints:
         """Return the number of the face or cell that each of the given cells lies in, shape (cells.num_cells,).
 
         Raises:
@@ -243,17 +278,17 @@ class CellwiseSpace(ufl.FunctionSpace):
         if self.hierarchy is None:
             return cells.face
         if cells.hierarchy is self.hierarchy:
-            return np.arange(cells.num_cells, dtype=np.int32)
-        coarse = self.cells
+            return cells.partition.cells.numbers
         found = np.full(cells.num_cells, -1, dtype=np.int32)
         keys = _cell_keys(cells)
-        for l in range(self.hierarchy.num_levels):
-            mine = np.flatnonzero(coarse.level == l).astype(np.int32)
-            known = _cell_keys(coarse)[mine]  # ascending, as the faces of a level are
+        first = 0
+        for l, stage in enumerate(self.hierarchy.stages[: self.hierarchy.num_levels]):
+            known = stage.level.keys[stage.active_faces]
             ancestor = keys >> 2 * np.maximum(cells.level.astype(np.int64) - l, 0)
             place = np.minimum(np.searchsorted(known, ancestor), known.size - 1)
             inside = (cells.level >= l) & (known[place] == ancestor) if known.size else np.zeros(keys.size, dtype=bool)
-            found[inside] = mine[place[inside]]
+            found[inside] = first + place[inside]
+            first += known.size
         if (found < 0).any():
             raise ValueError(
                 f"the values of {np.count_nonzero(found < 0)} of {found.size} cells are not known: a function that is "
@@ -348,23 +383,18 @@ def functionspace(
     Raises:
         TypeError: If `mesh` is no control mesh.
         ValueError: If the element is none of ours, or the planar surface folds.
-        NotImplementedError: If the mesh is distributed over several ranks or has creases inside.
+        NotImplementedError: If the mesh has creases inside.
     """
     if not isinstance(mesh, ControlMesh):
         raise TypeError(f"functionspace needs a thccs_fem.mesh.ControlMesh, got {type(mesh).__name__}")
     if boundary not in ("clamped", "crease"):
         raise ValueError(f'boundary is {boundary!r}; it must be "clamped" or "crease"')
-    if mesh.comm is not None and mesh.comm.size > 1:
-        raise NotImplementedError(
-            f"the communicator has {mesh.comm.size} ranks, but spaces are serial so far: run on one rank, or give each "
-            f"rank its own mesh with comm=MPI.COMM_SELF"
-        )
     value_shape = _value_shape(element)
     if element[0] == "DG":
         return CellwiseSpace(mesh, value_shape=value_shape)
     hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level)
     space = FunctionSpace(hierarchy, value_shape)
-    check_no_folds(space.cells)
+    together(mesh.comm, lambda: check_no_folds(space.cells))
     return space
 
 
@@ -387,8 +417,11 @@ def _checked_shape(shape: object) -> tuple[int, ...]:
 
 def _cell_keys(cells: Cells) -> npt.NDArray[np.int64]:
     """Return the key of each cell on its level, shape (num_cells,)."""
-    keys = [stage.level.keys for stage in cells.hierarchy.stages]
-    return np.concatenate([keys[l][cells.level_face[cells.level == l]] for l in range(cells.hierarchy.num_levels)])
+    keys = np.zeros(cells.num_cells, dtype=np.int64)
+    for l in range(cells.hierarchy.num_levels):
+        here = cells.level == l
+        keys[here] = cells.hierarchy.stages[l].level.keys[cells.level_face[here]]
+    return keys
 
 
 def _limit_points(hierarchy: Hierarchy, l: int) -> npt.NDArray[np.float64]:

@@ -44,10 +44,10 @@ def pointer(array: npt.NDArray[Any], memory: list[Any] | None = None) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Which dofs share a set, for scalar functions.
+    """Which dofs share a set, for scalar functions: a row for each dof that this rank owns.
 
     Attributes:
-        indptr: Beginning of each row, shape (num_dofs + 1,).
+        indptr: Beginning of each row, shape (owned dofs + 1,).
         indices: Dofs that share a set with the row's, ascending, shape (nnz,).
         starts: First of the positions of each set, shape (num_sets + 1,).
         positions: For a set of n dofs, n * n places in the rows of its dofs, counted from the beginning of the row:
@@ -89,7 +89,8 @@ def pattern(cells: Cells, across_facets: bool) -> Pattern:
     """
     kept = _patterns.setdefault(cells, {})
     if across_facets not in kept:
-        kept[across_facets] = _new_pattern(cells.num_dofs, *_sets(cells, across_facets))
+        owned = cells.partition.functions.size_local
+        kept[across_facets] = _new_pattern(owned, cells.num_dofs, *_sets(cells, across_facets))
     return kept[across_facets]
 
 
@@ -99,7 +100,7 @@ def _sets(cells: Cells, across_facets: bool) -> tuple[Ints, Ints]:
     return np.concatenate([np.diff(offsets) for offsets, _ in parts]), np.concatenate([dofs for _, dofs in parts])
 
 
-def _new_pattern(num_dofs: int, sizes: Ints, dofs: Ints) -> Pattern:
+def _new_pattern(num_owned: int, num_dofs: int, sizes: Ints, dofs: Ints) -> Pattern:
     offsets = _offsets(sizes, "dofs of all cells").astype(np.int32)
     local = np.arange(dofs.size, dtype=np.int32) - np.repeat(offsets[:-1], sizes)
     of_dofs = sp.csr_array((local, dofs, offsets), shape=(sizes.size, num_dofs)).tocsc()
@@ -108,8 +109,9 @@ def _new_pattern(num_dofs: int, sizes: Ints, dofs: Ints) -> Pattern:
     lengths = np.zeros(num_dofs, dtype=np.int32)
     scratch = np.full(num_dofs, -1, dtype=np.int32)
     lib.thccs_sparsity(num_dofs, *incidence, pointer(scratch), pointer(lengths), library().ffi.NULL)
-    if lengths.max() > LONGEST_ROW:
-        others = f"{lengths.max()} others, more than {LONGEST_ROW}"
+    longest = int(lengths.max(initial=0))
+    if longest > LONGEST_ROW:
+        others = f"{longest} others, more than {LONGEST_ROW}"
         raise ValueError(f"a dof shares cells with {others}: split the pole that it is at")
     indptr = _offsets(lengths, "entries of the matrix").astype(np.int32)
     indices = np.zeros(indptr[-1], dtype=np.int32)
@@ -117,7 +119,7 @@ def _new_pattern(num_dofs: int, sizes: Ints, dofs: Ints) -> Pattern:
     next_entries = indptr[:-1].copy()
     lib.thccs_sparsity(num_dofs, *incidence, pointer(scratch), pointer(next_entries), pointer(indices))
     starts = np.concatenate([[0], np.cumsum(sizes.astype(np.int64) ** 2)])
-    positions = np.zeros(starts[-1], dtype=np.uint8 if lengths.max() <= 256 else np.uint16)
+    positions = np.zeros(starts[-1], dtype=np.uint8 if longest <= 256 else np.uint16)
     lib.thccs_positions(
         num_dofs,
         *incidence,
@@ -125,6 +127,9 @@ def _new_pattern(num_dofs: int, sizes: Ints, dofs: Ints) -> Pattern:
         positions.itemsize,
         pointer(positions),
     )
+    if num_owned < num_dofs:
+        indptr = indptr[: num_owned + 1].copy()
+        indices = indices[: indptr[-1]].copy()
     return Pattern(indptr, indices, starts, positions)
 
 
