@@ -14,4 +14,4 @@ from hypothesis import settings
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
 
-collect_ignore = ["benchmarks"]  # scripts, run by `make bench`
+collect_ignore = ["benchmarks", "parallel"]  # run by `make bench` and, on several ranks, by tests in `tests/mpi`

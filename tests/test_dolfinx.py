@@ -7,13 +7,11 @@ import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from problems import lifted, moved_inside, randomly_refined
-from ranks import Comm, on_ranks
 
 import ufl
 from thccs_fem import adapt, fem, generators
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.scipy import LinearProblem
-from thccs_fem.hierarchy import Hierarchy
 from ufl import dx, grad, inner
 
 pytest.importorskip("mpi4py.MPI")
@@ -153,7 +151,9 @@ def test_cells_may_have_another_order_than_pieces(monkeypatch: pytest.MonkeyPatc
     create, Topology = dolfinx.mesh.create_mesh, dolfinx.mesh.Topology
     order = np.random.default_rng(3).permutation(V.cells.num_pieces)
     original = property(lambda topology: order[topology._cpp_object.original_cell_index])
-    monkeypatch.setattr(dolfinx.mesh, "create_mesh", lambda comm, cells, e, x: create(comm, cells[order], e, x))
+    monkeypatch.setattr(
+        dolfinx.mesh, "create_mesh", lambda comm, cells, e, x, **kw: create(comm, cells[order], e, x, **kw)
+    )
     monkeypatch.setattr(Topology, "original_cell_index", original)
     piece = bridge.mesh(V).topology.original_cell_index
     assert (piece != np.arange(piece.size)).any()
@@ -184,12 +184,3 @@ def test_what_is_no_space_is_refused() -> None:
     Q = bridge.functionspace(fem.functionspace(generators.rectangle((2, 2)), ("THCCS", 3)))
     with pytest.raises(TypeError, match=r"a space from thccs_fem\.fem\.functionspace is needed, got FunctionSpace"):
         bridge.mesh(Q)
-
-
-def test_several_ranks_are_refused() -> None:
-    def of_several_ranks(comm: Comm) -> None:
-        bridge.mesh(fem.FunctionSpace(Hierarchy.on(generators.rectangle((2, 2), comm=comm))))
-
-    for error in on_ranks(3, of_several_ranks):
-        assert isinstance(error, NotImplementedError)
-        assert "has 3 ranks, but the bridge to DOLFINx is serial" in str(error)

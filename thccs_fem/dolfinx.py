@@ -8,8 +8,8 @@ matrix of a form there and C the extraction matrix, C^T A C is ours.
 **The cells of that mesh hang together nowhere**, since pieces meet in sides of different length where one is finer: no
 point belongs to two cells, every side is a boundary of the mesh, and ``ds`` integrates over all of them.
 
-DOLFINx sorts cells anew: cell i of its mesh is the piece ``mesh(V).topology.original_cell_index[i]`` of ``V.cells``,
-and ``V.cells.piece_cell`` and ``V.cells.tag`` lead on to our cell and to its tag.
+DOLFINx sorts cells anew: `pieces` says which piece of ``V.cells`` each cell of its mesh is; ``V.cells.piece_cell`` and
+``V.cells.tag`` lead on to our cell and to its tag. On several ranks each has the pieces of the cells that it owns.
 
     >>> import dolfinx, ufl
     >>> import thccs_fem.dolfinx as bridge
@@ -42,12 +42,13 @@ import scipy.sparse as sp
 import basix.ufl
 from thccs_fem import element
 from thccs_fem.extraction import Cells
+from thccs_fem.fem.blocks import Layout
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.petsc.matrices import new_mat
+from thccs_fem.fem.petsc.matrices import comm_of, sharing
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.subdivision import Ints
 
-__all__ = ["extraction_matrix", "function", "functionspace", "mesh"]
+__all__ = ["extraction_matrix", "function", "functionspace", "mesh", "pieces"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -63,39 +64,50 @@ def mesh(V: FunctionSpace | CellwiseSpace) -> dolfinx.mesh.Mesh[np.float64]:
 
     Raises:
         TypeError: V is no space of ours.
-        NotImplementedError: The mesh is distributed over several ranks.
     """
     if not isinstance(V, FunctionSpace | CellwiseSpace):
         raise TypeError(f"a space from thccs_fem.fem.functionspace is needed, got {type(V).__name__}")
-    comm = MPI.COMM_SELF if V.mesh.comm is None else V.mesh.comm
-    if comm.size > 1:
-        raise NotImplementedError(
-            f"the communicator has {comm.size} ranks, but the bridge to DOLFINx is serial so far: run on one rank, or "
-            f"give each rank its own mesh with comm=MPI.COMM_SELF"
-        )
     if V.cells not in _meshes:
-        _meshes[V.cells] = _mesh(V.cells, comm)
+        _meshes[V.cells] = _mesh(V.cells, MPI.COMM_SELF if V.mesh.comm is None else V.mesh.comm)
     return _meshes[V.cells]
 
 
 def _mesh(cells: Cells, comm: MPI.Comm) -> dolfinx.mesh.Mesh[np.float64]:
     lagrange = basix.ufl.element("Lagrange", "quadrilateral", element.DEGREE)
-    points = element.bicubic_values(lagrange.basix_element.points) @ cells.piece_points
+    points = element.bicubic_values(lagrange.basix_element.points) @ cells.piece_points[_owned_pieces(cells)]
     num_pieces, num_nodes, gdim = points.shape
+    first = num_nodes * sum(comm.allgather(num_pieces)[: comm.rank])
     coordinates: Any = basix.ufl.blocked_element(lagrange, shape=(gdim,))  # what DOLFINx takes, by another type's name
     return dolfinx.mesh.create_mesh(
         comm,
-        np.arange(num_pieces * num_nodes).reshape(num_pieces, num_nodes),
+        first + np.arange(num_pieces * num_nodes).reshape(num_pieces, num_nodes),
         coordinates,
         points.reshape(-1, gdim),
+        partitioner=_where_they_are,
     )
+
+
+def _where_they_are(comm: MPI.Comm, parts: int, cell_types: Any, cells: Any) -> Any:
+    """Return the rank of each cell that this rank has, its own: DOLFINx need not move any. Cells are four corners."""
+    return dolfinx.graph.adjacencylist(np.full((cells[0].size // 4, 1), comm.rank, dtype=np.int32))._cpp_object
+
+
+def pieces(V: FunctionSpace | CellwiseSpace) -> Ints:
+    """Return the piece of ``V.cells`` that each cell of `mesh(V)` on this rank is, shape (cells of mesh(V),)."""
+    owned = _owned_pieces(V.cells)
+    first = sum(mesh(V).comm.allgather(owned.size)[: mesh(V).comm.rank])
+    return owned[mesh(V).topology.original_cell_index - first]
+
+
+def _owned_pieces(cells: Cells) -> Ints:
+    return np.flatnonzero(cells.piece_cell < cells.num_owned).astype(np.int32)
 
 
 def functionspace(V: FunctionSpace | CellwiseSpace) -> dolfinx.fem.FunctionSpace[np.float64]:
     """Return the discontinuous space of degree 3 on `mesh(V)`, with values of the shape of V's: V is part of it.
 
     Raises:
-        TypeError, NotImplementedError: As for `mesh`.
+        TypeError: As for `mesh`.
     """
     return dolfinx.fem.functionspace(mesh(V), ("DQ", element.DEGREE, V.value_shape))
 
@@ -107,12 +119,12 @@ def function(uh: Function) -> dolfinx.fem.Function[np.float64]:
         uh: The function, which may be a cellwise one, as `fem.cell_sizes`; its values are copied.
 
     Raises:
-        TypeError, NotImplementedError: As for `mesh`.
+        TypeError: As for `mesh`.
     """
     V = uh.ufl_function_space()
     Q = functionspace(V)
     result: dolfinx.fem.Function[np.float64] = dolfinx.fem.Function(Q, name=uh.name, dtype=np.float64)
-    values = _at_nodes(Q) @ uh.local_coefficients()[_piece(Q)]
+    values = _at_nodes(Q) @ uh.local_coefficients()[pieces(V)]
     result.x.array.reshape(-1, V.block_size)[Q.dofmap.list] = values
     return result
 
@@ -126,18 +138,18 @@ def extraction_matrix(V: FunctionSpace) -> PETSc.Mat:
         Shape (dofs of functionspace(V), V.num_dofs), with the blocks of V.
 
     Raises:
-        TypeError, NotImplementedError: As for `mesh`.
+        TypeError: As for `mesh`.
     """
     Q = functionspace(V)
-    local = sp.kron(sp.eye_array(V.cells.num_pieces), _at_nodes(Q), format="csr")
+    local = sp.kron(sp.eye_array(len(Q.dofmap.list)), _at_nodes(Q), format="csr")
     node_of_dof = np.argsort(Q.dofmap.list, axis=None)
-    C = sp.csr_array((local @ V.cells.rows(_piece(Q)))[node_of_dof])
-    return new_mat(sp.csr_array(sp.kron(C, sp.eye_array(V.block_size), format="csr")), (V, V))
-
-
-def _piece(Q: dolfinx.fem.FunctionSpace[np.float64]) -> Ints:
-    """Return the piece that each cell is, shape (num_pieces,)."""
-    return Q.mesh.topology.original_cell_index.astype(np.int32)
+    C = sp.csr_array((local @ V.cells.rows(pieces(V)))[node_of_dof])
+    C = sp.csr_array(sp.kron(C, sp.eye_array(V.block_size), format="csr"))
+    C.sort_indices()
+    columns = None if V.index_map.is_whole else Layout((V,)).global_numbers
+    mat = sharing(C, comm_of(V), columns, V.num_owned_dofs)
+    mat.setBlockSizes(V.block_size, V.block_size)
+    return mat
 
 
 def _at_nodes(Q: dolfinx.fem.FunctionSpace[np.float64]) -> Floats:

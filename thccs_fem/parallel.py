@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 PATIENCE = 2.0  # seconds that a rank that fails waits for others to fail as well, before it ends them
+FIRST = "first_rank"  # attribute of errors that were raised on another rank: of that rank
 FAILED = 29_876  # tag of the messages of ranks that fail; any number that users do not happen to use
 
 type Report = tuple[bytes, str]  # a class, pickled, and a message
@@ -110,7 +111,9 @@ def together[T](comm: Any, work: Callable[[], T]) -> T:
     for rank, report in enumerate(reports):
         if report is not None:
             kind, message = report
-            raise pickle.loads(kind)(f"rank {rank} of {comm.size}: {message}") from raised
+            error = pickle.loads(kind)(f"rank {rank} of {comm.size}: {message}")
+            vars(error)[FIRST] = rank
+            raise error.with_traceback(raised.__traceback__ if raised else None) from None
     return result
 
 
@@ -201,7 +204,8 @@ class _EndTogether:
             failed = self._failed(line)
         except Exception:  # the communicator is no longer there, say: then this rank stands for itself
             failed = {self.comm.rank: line}
-        if self.comm.rank == min(failed):
+        first = getattr(error, FIRST, -1)  # which has the traceback that leads to where it happened
+        if self.comm.rank == (first if first in failed else min(failed)):
             self._show(failed, kind, error, trace)
         elif len(failed) < self.comm.size:
             time.sleep(5 * PATIENCE)  # the first ends us meanwhile

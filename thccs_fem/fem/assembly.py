@@ -15,12 +15,14 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 import ufl
+from thccs_fem.fem.entries import at_owners
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.forms import form as compile_form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.loops import cell_loops, loops
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.fem.sparsity import Pattern, pattern, pointer
+from thccs_fem.index_map import IndexMap
 from thccs_fem.jit import library
 
 __all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector", "bubble_energies", "integrals"]
@@ -153,8 +155,36 @@ def _new_matrix(form: Form) -> sp.csr_array:
     _add_matrix(form, values)
     shape = indptr.size - 1, form.cells.num_dofs * form.spaces[1].block_size
     A = sp.csr_array((values, indices, indptr), shape=shape)
-    test, trial = (_blocked_transfer(form, space) for space in form.spaces)
-    return A if test is None and trial is None else _carried(A, test, trial)
+    return _on_coarser(A, form) if _is_coarser(form) else A
+
+
+def _is_coarser(form: Form) -> bool:
+    """Return whether an argument is on a coarser hierarchy than that which is integrated on."""
+    return any(space.hierarchy in form.transfers for space in form.spaces)
+
+
+def _on_coarser(A: sp.csr_array, form: Form) -> sp.csr_array:
+    """Return the matrix of a form in terms of its arguments' dofs; collective, as several ranks contribute to a row.
+
+    Args:
+        A: The matrix in terms of the dofs of the form's finest hierarchy.
+        form: The form.
+    """
+    (test, trial), (T, U) = form.spaces, (form.transfers.get(space.hierarchy) for space in form.spaces)
+    T_owned = None if T is None else _blocked(T.matrix, test)[: A.shape[0]]
+    entries = _carried(A, T_owned, None if U is None else _blocked(U.matrix, trial)).tocoo()
+    rows, columns, values = entries.row, entries.col, np.asarray(entries.data)
+    columns = _dofs(trial, trial.index_map.numbers if U is None else U.wanted)[columns]
+    if T is not None:
+        starts = test.block_size * test.index_map.starts
+        rows = _dofs(test, _global(test.index_map, T.wanted))[rows]
+        rows, columns, values = at_owners(test.mesh.comm, starts, rows, columns, values)
+        rows = rows - test.block_size * test.index_map.local_range[0]
+    local = trial.index_map.local_of(columns // trial.block_size)
+    columns = trial.block_size * local + columns % trial.block_size
+    A = sp.csr_array((values, (rows, columns)), shape=(test.num_owned_dofs, trial.num_local_dofs))
+    A.sort_indices()
+    return A
 
 
 def _carried(A: sp.csr_array, test: sp.csr_array | None, trial: sp.csr_array | None) -> sp.csr_array:
@@ -182,7 +212,7 @@ def _carried(A: sp.csr_array, test: sp.csr_array | None, trial: sp.csr_array | N
 
 def _refill(A: sp.csr_array, form: Form) -> None:
     _check_rank(form, 2)
-    if any(space.hierarchy in form.transfers for space in form.spaces):
+    if _is_coarser(form):
         new = _new_matrix(form)
         _check_structure(A, new.indptr, new.indices)
         A.data[:] = new.data
@@ -227,6 +257,17 @@ def _pattern(form: Form) -> Pattern:
     return pattern(form.cells, any(integral.kind == "interior_facet" for integral in form.integrals))
 
 
-def _blocked_transfer(form: Form, space: FunctionSpace) -> sp.csr_array | None:
-    scalar = form.transfers.get(space.hierarchy)
-    return None if scalar is None else sp.csr_array(sp.kron(scalar, sp.eye_array(space.block_size), format="csr"))
+def _blocked(scalar: sp.csr_array, space: FunctionSpace) -> sp.csr_array:
+    """Return what carries every component as `scalar` carries one."""
+    return sp.csr_array(sp.kron(scalar, sp.eye_array(space.block_size), format="csr"))
+
+
+def _dofs(space: FunctionSpace, functions: Ints) -> Ints:
+    """Return the numbers of the dofs of functions, from theirs."""
+    components = np.arange(space.block_size, dtype=np.int32)
+    return np.asarray(space.block_size * functions[:, None] + components, dtype=np.int32).ravel()
+
+
+def _global(index_map: IndexMap, numbers: Ints) -> Ints:
+    """Return PETSc's numbers of things, from those in the hierarchy."""
+    return numbers if index_map.global_numbers is None else index_map.global_numbers[numbers]

@@ -5,6 +5,8 @@ so that a symmetric matrix stays symmetric, and what the columns held goes to th
 
 On a closed surface without conditions, and for pure Neumann problems, constants are in the kernel of the matrix. Then
 the load must have mean zero, and the solution that has mean zero is wanted.
+
+On several ranks vectors have the dofs that a rank owns, and sums go over all ranks: see `blocks.Layout`.
 """
 
 from __future__ import annotations
@@ -16,16 +18,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
-from scipy.sparse import csgraph
 
 import ufl
 from thccs_fem.fem import blocks
 from thccs_fem.fem.assembly import integrals
 from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout, constraints
 from thccs_fem.fem.checks import lowered
+from thccs_fem.fem.entries import at_owners
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import gathered, largest, rank_of, smallest, together, total
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = [
@@ -36,8 +39,10 @@ __all__ = [
     "constrain",
     "constraints",
     "drops_constants",
+    "is_finite",
     "is_fourth_order",
     "is_symmetric",
+    "norm",
     "unfixed_constants",
 ]
 
@@ -61,7 +66,7 @@ class LinearSystem:
         bcs: Conditions; others may be put in their place before the next `assemble`.
         unknowns: The unknowns.
         load: What is added to b; None: nothing.
-        b: Right-hand side, zero before the first `assemble`, shape (num_dofs,).
+        b: Right-hand side, zero before the first `assemble`, shape (layout.num_owned,).
         constants: Constants in the kernel of A, of which b is cleared; None if there are none.
     """
 
@@ -84,7 +89,7 @@ class LinearSystem:
         self._is_single = len(spaces) == 1 and not isinstance(a if u is None else u, list | tuple)
         self.bcs = bcs
         self.load = load
-        self.b = np.zeros(self.layout.num_dofs)
+        self.b = np.zeros(self.layout.num_owned)
         self.constants: Constants | None = None
         self._tolerance = np.where(drops_constants(self.a, spaces), PRESCRIBED, VANISHING)
         self._dofs, self._values = self.layout.constraints(bcs)
@@ -109,23 +114,23 @@ class LinearSystem:
         return self.matrix.whole
 
     def assemble(self) -> None:
-        """Assemble A and b with the present values of coefficients, constants, conditions and load.
+        """Assemble A and b with the present values of coefficients, constants, conditions and load; collective.
 
         Raises:
             ValueError: A load that is not zero on average, where constants are in the kernel, or of another shape.
         """
         self._dofs, self._values = self.layout.constraints(self.bcs)
         if self._matrix is None:
-            self._matrix = BlockMatrix(self.a, self.layout.spaces)
+            self._matrix = BlockMatrix(self.a, self.layout)
         else:
             self._matrix.assemble()
         A = self._matrix.whole
-        self.b[:] = self.layout.vector(self.L) + self._checked_load()
+        self.b[:] = self.layout.vector(self.L) + together(self.layout.comm, self._checked_load)
         if self._dofs.size:
-            prescribed = np.zeros(self.b.size)
+            prescribed = np.zeros(self.layout.num_local)
             prescribed[self._dofs] = self._values
             self.b -= A @ prescribed
-            self.b[self._dofs] = self._values
+            self._prescribe(self.b)
             constrain(A, self._dofs)
         self.constants = unfixed_constants(A, self.layout, self._tolerance, self._dofs)
         if self.constants is not None:
@@ -139,25 +144,40 @@ class LinearSystem:
     def accept(self, x: Floats) -> Any:
         """Return the unknowns with the values that solve the equations, prescribed values exact, free means zero."""
         x = x.copy() if self.constants is None else self.constants.with_mean_zero(x)
-        x[self._dofs] = self._values
+        self._prescribe(x)
         self.layout.spread(x, self.unknowns)
         return self.u
 
+    def _prescribe(self, x: Floats) -> None:
+        """Put prescribed values in their place in a vector."""
+        owned = np.searchsorted(self._dofs, x.size)
+        x[self._dofs[:owned]] = self._values[:owned]
+
     def _checked_load(self) -> Floats | float:
+        """Return what is added to b of the dofs that this rank owns."""
         if self.load is None:
             return 0.0
-        load = np.asarray(self.load, dtype=np.float64)
-        if load.shape != self.b.shape:
-            raise ValueError(f"load has shape {load.shape}, but there are {self.b.size} dofs: give ({self.b.size},)")
-        return load
+        load, n = np.asarray(self.load, dtype=np.float64), self.layout.num_local
+        if load.shape != (n,):
+            where = "" if self.layout.is_whole else " on this rank, ghosts included"
+            raise ValueError(f"load has shape {load.shape}, but there are {n} dofs{where}: give ({n},)")
+        spaces = self.layout.spaces
+        ends = np.cumsum([V.num_local_dofs for V in spaces])
+        return np.concatenate([x[: V.num_owned_dofs] for x, V in zip(np.split(load, ends[:-1]), spaces, strict=True)])
 
 
 # ---- Dirichlet conditions --------------------------------------------------------------------------------------------
 
 
 def constrain(A: sp.csr_array, dofs: Ints, *, columns: bool = True) -> None:
-    """Make rows of dofs those of the identity, and columns too, in place; entries off the diagonal stay as zeros."""
-    prescribed = np.zeros(A.shape[0], dtype=bool)
+    """Make rows of dofs those of the identity, and columns too, in place; entries off the diagonal stay as zeros.
+
+    Args:
+        A: The matrix, with a row for each dof that this rank owns, and columns for ghosts as well.
+        dofs: Local dofs, ghosts included.
+        columns: Whether columns are changed too.
+    """
+    prescribed = np.zeros(A.shape[1], dtype=bool)
     prescribed[dofs] = True
     rows = np.repeat(np.arange(A.shape[0], dtype=np.int32), np.diff(A.indptr))
     A.data[prescribed[rows] | (columns & prescribed[A.indices])] = 0.0
@@ -172,24 +192,28 @@ class Constants:
     """Functions in the kernel of a matrix that are 1 in one component on one connected part of the surface, and else 0.
 
     Attributes:
-        number: Which of them has coefficient 1 at each dof (at most one has), or -1, shape (num_dofs,).
-        integrals: Integral of the function of each dof, shape (num_dofs,).
+        number: Which of them has coefficient 1 at each dof (at most one has), or -1, shape (owned dofs,).
+        integrals: Integral of the function of each dof, shape (owned dofs,).
         load: Which load each dof is loaded by, one for all components of an unknown on one connected part of the
-            surface, which have one unit; -1 where it is prescribed. Shape (num_dofs,).
+            surface, which have one unit; -1 where it is prescribed. Shape (owned dofs,).
+        loads: Which load each constant belongs to, shape (num_constants,), the same on all ranks.
+        comm: Communicator, or None. Sums go over all its ranks.
     """
 
     number: Ints
     integrals: Floats
     load: Ints
+    loads: Ints
+    comm: Any = None
 
     def __post_init__(self) -> None:
-        for array in (self.number, self.integrals, self.load):
+        for array in (self.number, self.integrals, self.load, self.loads):
             array.setflags(write=False)
 
     @property
     def num_constants(self) -> int:
         """Number of linearly independent ones."""
-        return int(self.number.max()) + 1
+        return self.loads.size
 
     @property
     def areas(self) -> Floats:
@@ -198,10 +222,10 @@ class Constants:
 
     def sums(self, x: Floats) -> Floats:
         """Return the sum of x over the dofs of each, shape (num_constants,)."""
-        return np.bincount(self.number + 1, weights=x, minlength=self.num_constants + 1)[1:]
+        return total(self.comm, np.bincount(self.number + 1, weights=x, minlength=self.num_constants + 1)[1:])
 
     def spread(self, values: Floats) -> Floats:
-        """Return the coefficients of a linear combination, shape (num_dofs,)."""
+        """Return the coefficients of a linear combination, shape (owned dofs,)."""
         return np.append(values, 0.0)[self.number]  # -1 takes the last
 
     def with_mean_zero(self, x: Floats) -> Floats:
@@ -220,8 +244,9 @@ class Constants:
         """
         totals = self.sums(b)
         means = totals / self.areas
-        _, first = np.unique(self.number, return_index=True)
-        of_all = np.bincount(self.load + 1, weights=np.abs(b))[1:][self.load[first[-self.num_constants :]]]
+        num_loads = int(self.loads.max()) + 1
+        of_loads = np.bincount(self.load + 1, weights=np.abs(b), minlength=num_loads + 1)
+        of_all = total(self.comm, of_loads[1 : num_loads + 1])[self.loads]
         if (np.abs(totals) > INCOMPATIBLE * self.sums(np.abs(b)) + ROUNDING * of_all).any():
             listed = ", ".join(repr(float(mean)) for mean in means)
             several = (
@@ -238,13 +263,20 @@ class Constants:
 
         For a load without mean it has the solution of A that vanishes at these dofs.
         """
-        _, first = np.unique(self.number, return_index=True)
-        pins = first[-self.num_constants :]
+        pins = self._pins()
         data = A.data.copy()
         rows = np.repeat(np.arange(A.shape[0], dtype=np.int32), np.diff(A.indptr))
         diagonal = np.flatnonzero((rows == A.indices) & np.isin(rows, pins))
         data[diagonal] *= 2.0
         return sp.csr_array((data, A.indices, A.indptr), shape=A.shape)
+
+    def _pins(self) -> Ints:
+        """Return the first dof of each constant, where this rank is the first that has one."""
+        found, first = np.unique(self.number, return_index=True)
+        has = np.zeros(self.num_constants, dtype=bool)
+        has[found[found >= 0]] = True
+        mine = np.argmax(gathered(self.comm, has[None]), axis=0) == rank_of(self.comm)
+        return first[found >= 0][mine[found[found >= 0]]].astype(np.int32)
 
 
 def drops_constants(a: Sequence[Sequence[Form | None]], spaces: Sequence[FunctionSpace]) -> Bools:
@@ -286,41 +318,87 @@ def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: 
     """
     component, k = layout.component, tolerance.size
     is_connected = all(V.mesh.num_components == 1 for V in layout.spaces)
-    if k == 1 and is_connected and dofs is not None and dofs.size:
+    if k == 1 and is_connected and dofs is not None and total(layout.comm, dofs.size):
         return None
     ones = (component[:, None] == np.arange(k)).astype(np.float64)
-    vanishing = _vanishing(A, ones, tolerance) & _vanishing(A.T, ones, tolerance)
-    if not vanishing.any(axis=0).any():
+    n = layout.num_owned
+    size = np.stack([abs(A) @ np.ones(A.shape[1]), layout.without_ghosts(abs(A).T @ np.ones(n))], axis=1)
+    component = component[:n]
+    vanishing = np.abs(A @ ones) <= tolerance * size[:, :1]
+    vanishing &= np.abs(layout.without_ghosts(A.T @ ones[:n])) <= tolerance * size[:, 1:]
+    if not total(layout.comm, vanishing.any(axis=0).astype(int)).any():
         return None
-    part = np.zeros(component.size, dtype=np.int32)
-    if not is_connected:
-        _, part = csgraph.connected_components(A, directed=False)  # stored zeros connect as well
-    defects = np.zeros((int(part.max()) + 1, k), dtype=np.int64)
+    part = _parts(layout)
+    defects, members = np.zeros((2, layout.spaces[0].mesh.num_components, k), dtype=np.int64)
     np.add.at(defects, part, ~vanishing)
-    free = np.zeros(defects.shape, dtype=bool)
-    free[part, component] = True
-    free &= defects == 0
+    np.add.at(members, (part, component), 1)
+    free = (total(layout.comm, members) > 0) & (total(layout.comm, defects) == 0)
     if not free.any():
         return None
     number = np.where(free, np.cumsum(free).reshape(free.shape) - 1, -1).astype(np.int32)
-    unknown = np.repeat(np.arange(len(layout.spaces), dtype=np.int32), [V.num_dofs for V in layout.spaces])
-    load = unknown + len(layout.spaces) * part
-    load[[] if dofs is None else dofs] = -1
-    each = [np.repeat(integrals(FunctionSpace(V.hierarchy)), V.block_size) for V in layout.spaces]
-    return Constants(number[part, component], np.concatenate(each), load)
+    unknown_of = np.repeat(np.arange(len(layout.spaces), dtype=np.int32), [V.block_size for V in layout.spaces])
+    load_of = unknown_of + len(layout.spaces) * np.arange(free.shape[0], dtype=np.int32)[:, None]
+    load = load_of[part, component]
+    load[[] if dofs is None else dofs[dofs < n]] = -1
+    each = [np.repeat(integrals(FunctionSpace(V.hierarchy)), V.block_size)[: V.num_owned_dofs] for V in layout.spaces]
+    return Constants(number[part, component], np.concatenate(each), load, load_of[free], layout.comm)
 
 
-def _vanishing(A: Any, ones: Floats, tolerance: Floats) -> Bools:
-    """Return where A @ ones is but rounding."""
-    return np.abs(A @ ones) <= tolerance * (abs(A) @ np.ones(A.shape[1]))[:, None]
+def _parts(layout: Layout) -> Ints:
+    """Return the connected part of the surface that each owned dof is on, shape (num_owned,)."""
+    found = []
+    for V in layout.spaces:
+        mesh, cells = V.mesh, V.cells
+        part = np.zeros(cells.num_dofs + 1, dtype=np.int32)
+        if mesh.num_components > 1:
+            of_faces = mesh.vertex_components[mesh.face_vertices[mesh.face_offsets[:-1]]]
+            for batch in cells.batches:  # -1, where there is no dof, is the last
+                part[batch.dofs] = of_faces[cells.face[batch.cells], None]
+        found.append(np.repeat(part[: V.index_map.size_local], V.block_size))
+    return np.concatenate(found)
 
 
 # ---- Has it worked? --------------------------------------------------------------------------------------------------
 
 
-def is_symmetric(A: sp.csr_array) -> bool:
-    """Return whether a matrix is symmetric up to rounding."""
-    return bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
+def is_symmetric(A: sp.csr_array, layout: Layout | None = None) -> bool:
+    """Return whether a matrix is symmetric up to rounding; collective.
+
+    Args:
+        A: The matrix.
+        layout: Its dofs; None in serial.
+    """
+    if layout is None or layout.is_whole:
+        return bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
+    n = A.shape[0]
+    own, others = A[:, :n], A[:, n:]
+    difference = max(_largest(own - own.T), _largest(others - _transposed(others, layout)))
+    return largest(layout.comm, difference) <= SYMMETRIC * largest(layout.comm, _largest(A))
+
+
+def _largest(A: sp.csr_array) -> float:
+    return float(np.abs(A.data).max(initial=0.0))
+
+
+def _transposed(A: sp.csr_array, layout: Layout) -> sp.csr_array:
+    """Return what other ranks have in the columns of this rank's dofs, as A has what this one has in theirs."""
+    own, ghosts = np.split(layout.global_numbers, [A.shape[0]])
+    entries = A.tocoo()
+    rows, columns, values = at_owners(
+        layout.comm, layout.starts, ghosts[entries.col], own[entries.row], np.asarray(entries.data)
+    )
+    place = np.searchsorted(ghosts, columns)  # patterns are symmetric: all are there
+    return sp.csr_array((values, (rows - own[0] if own.size else rows, place)), shape=A.shape)
+
+
+def norm(comm: Any, x: Floats) -> float:
+    """Return the norm of a vector of which each rank has its part."""
+    return float(np.sqrt(total(comm, float(np.linalg.norm(x)) ** 2)))
+
+
+def is_finite(comm: Any, x: Floats) -> bool:
+    """Return whether all values are, on all ranks."""
+    return smallest(comm, float(np.isfinite(x).all())) > 0.0
 
 
 def is_fourth_order(a: Sequence[Sequence[Form | None]]) -> bool:
@@ -328,7 +406,7 @@ def is_fourth_order(a: Sequence[Sequence[Form | None]]) -> bool:
     return any(max(block.orders) > 1 for row in a for block in row if block)
 
 
-def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:
+def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats], comm: Any = None) -> None:
     """Raise if a factorised matrix is singular to working precision, which factorisations seldom notice.
 
     Solved for a random right-hand side, a singular matrix shows: the solution is as large as rounding lets it.
@@ -336,14 +414,16 @@ def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:
     Args:
         A: The matrix.
         solve: What its factors make of a right-hand side.
+        comm: Communicator, or None; each rank has its rows.
 
     Raises:
         RuntimeError: It is.
     """
     scale = np.sqrt(np.abs(A.diagonal()))
     scale[scale == 0.0] = 1.0
-    r = np.random.default_rng(0).standard_normal(scale.size)
-    condition = np.sqrt(scale.size) * np.linalg.norm(scale * solve(scale * r)) / np.linalg.norm(r)
+    r = np.random.default_rng(rank_of(comm)).standard_normal(scale.size)
+    size = total(comm, scale.size)
+    condition = np.sqrt(size) * norm(comm, scale * solve(scale * r)) / norm(comm, r)
     if not condition < LARGEST_CONDITION:  # nor is it NaN
         raise RuntimeError(
             f"the matrix is singular to working precision (condition number about {condition:.0e}), so that there is "
@@ -352,18 +432,25 @@ def check_regular(A: sp.csr_array, solve: Callable[[Floats], Floats]) -> None:
         )
 
 
-def check_residual(A: sp.csr_array, x: Floats, b: Floats, solver: str) -> None:
+def check_residual(A: sp.csr_array, x: Floats, b: Floats, solver: str, comm: Any = None) -> None:
     """Raise if x does not solve A x = b as it should when nothing was iterated.
+
+    Args:
+        A: The matrix.
+        x: The solution, with ghosts.
+        b: The right-hand side.
+        solver: Who found it.
+        comm: Communicator, or None; each rank has its rows.
 
     Raises:
         RuntimeError: It is not finite, or its residual is neither small against b nor rounding.
     """
-    if not np.isfinite(x).all():
+    if not is_finite(comm, x):
         raise RuntimeError(
             f"{solver} gave values that are not finite: see that coefficients and data are, and are not too big"
         )
-    residual, load = np.linalg.norm(b - A @ x), np.linalg.norm(b)
-    if residual > max(1e-6 * load, 1e-12 * np.linalg.norm(abs(A) @ np.abs(x))):
+    residual, load = norm(comm, b - A @ x), norm(comm, b)
+    if residual > max(1e-6 * load, 1e-12 * norm(comm, abs(A) @ np.abs(x))):
         raise RuntimeError(
             f"{solver} gave values that leave a residual of norm {residual:.3e}, for a right-hand side of norm "
             f"{load:.3e}: the matrix is too badly conditioned, or this solver does not solve systems by itself"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Literal
 
 from petsc4py import PETSc
@@ -15,11 +16,21 @@ import ufl
 from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.linear import Constants, LinearSystem, check_regular, check_residual, is_fourth_order, is_symmetric
+from thccs_fem.fem.linear import (
+    Constants,
+    LinearSystem,
+    check_regular,
+    check_residual,
+    is_finite,
+    is_fourth_order,
+    is_symmetric,
+    norm,
+)
 from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec
 from thccs_fem.fem.petsc.multigrid import has_coarse_level, multigrid
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import rank_of
 
 __all__ = ["LinearProblem", "choose", "failure", "null_space", "operators", "set_fields", "set_levels", "solved"]
 
@@ -64,7 +75,8 @@ class LinearProblem:
             in whose space they are; where two are in the same one, give a list of conditions for each unknown.
         u: Function that takes the solution, and has the initial guess if ``ksp_initial_guess_nonzero`` is set, or a
             list of them; None: new ones.
-        load: Vector that is added to the right-hand side, as of point loads, shape (num_dofs,).
+        load: Vector that is added to the right-hand side, as of point loads, shape (num_dofs,); on several ranks local,
+            as `fem.assemble_vector` returns it.
         petsc_options_prefix: What distinguishes the options of this problem, usually with "_" at the end.
         petsc_options: Options without the prefix, as ``{"ksp_type": "cg", "pc_type": "gamg"}``. They hold for this
             problem, and before those on the command line.
@@ -160,7 +172,7 @@ class LinearProblem:
         """Choose a solver unless the user did so, read options, and say which dofs belong together."""
         spaces = self._system.layout.spaces
         if not self._is_chosen:
-            symmetric = is_symmetric(self._system.A)
+            symmetric = is_symmetric(self._system.A, self._system.layout)
             V = spaces[0] if symmetric and len(spaces) == 1 else None
             choose(self._solver, self.A, symmetric, is_fourth_order(self._system.a), V)
             self._solver.setFromOptions()
@@ -170,17 +182,18 @@ class LinearProblem:
 
     def _check(self, x: Floats) -> None:
         """Raise if there is no solution."""
-        solver, pc, b = self._solver, self._solver.getPC(), self._system.b
+        solver, pc, system = self._solver, self._solver.getPC(), self._system
         reason: Any = solver.getConvergedReason()  # an int, other than the stubs say
         if reason <= 0:
             raise RuntimeError(
-                f"{failure(solver)}, for a right-hand side of norm {np.linalg.norm(b):.3e}. {help_for(reason)}"
+                f"{failure(solver)}, for a right-hand side of norm {self.b.norm():.3e}. {help_for(reason)}"
             )
+        comm = system.layout.comm
         if factorises(pc):
-            check_regular(self._system.A, lambda r: solved(pc.getFactorMatrix(), r))
+            check_regular(system.A, lambda r: solved(pc.getFactorMatrix(), r), comm)
         # "Converged by iterations" means that nobody looked.
-        if reason == PETSc.KSP.ConvergedReason.CONVERGED_ITS or not np.isfinite(x).all():
-            check_residual(self._system.A, x, b, name_of(solver))
+        if reason == PETSc.KSP.ConvergedReason.CONVERGED_ITS or not is_finite(comm, x):
+            check_residual(system.A, system.layout.with_ghosts(x), system.b, name_of(solver), comm)
 
 
 # ---- What nonlinear problems need as well ----------------------------------------------------------------------------
@@ -218,9 +231,9 @@ def factorises(pc: PETSc.PC) -> bool:
 def set_fields(pc: PETSc.PC, layout: Layout) -> None:
     """Tell a preconditioner which dofs belong to which of several unknowns."""
     if len(layout.spaces) > 1 and pc.getType() == "fieldsplit":  # other types forget it
-        ends = zip(layout.offsets[:-1], layout.offsets[1:], strict=True)
-        comm = comm_of(layout.spaces[0])
-        fields = [PETSc.IS().createStride(int(end - first), int(first), comm=comm) for first, end in ends]
+        comm, begin = comm_of(layout.spaces[0]), layout.starts[0 if layout.is_whole else rank_of(layout.comm)]
+        ends = pairwise((begin + layout.offsets).tolist())
+        fields = [PETSc.IS().createStride(end - first, first, comm=comm) for first, end in ends]
         pc.setFieldSplitIS(*((str(i), field) for i, field in enumerate(fields)))
 
 
@@ -239,8 +252,8 @@ def operators(
     A null space that was set from outside, as that of rigid motions, stays.
     """
     if A.getAttr("constants") is not None or not A.getNullSpace().handle:
-        A.setNullSpace(null_space(constants, A.comm))
-        A.setTransposeNullSpace(null_space(constants, A.comm))
+        A.setNullSpace(null_space(constants, comm_of(layout.spaces[0])))
+        A.setTransposeNullSpace(null_space(constants, comm_of(layout.spaces[0])))
         A.setAttr("constants", constants)
     if constants is None or not factorises(pc):
         return A, A
@@ -252,7 +265,7 @@ def null_space(constants: Constants | None, comm: Any) -> PETSc.NullSpace:
     if constants is None:
         return PETSc.NullSpace()  # takes away what was set before
     vectors = [constants.spread(unit) for unit in np.eye(constants.num_constants)]
-    return PETSc.NullSpace().create(vectors=[new_vec(v / np.linalg.norm(v), comm) for v in vectors], comm=comm)
+    return PETSc.NullSpace().create(vectors=[new_vec(v / norm(constants.comm, v), comm) for v in vectors], comm=comm)
 
 
 def name_of(solver: PETSc.KSP) -> str:

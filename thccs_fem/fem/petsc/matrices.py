@@ -1,4 +1,8 @@
-"""Matrices and vectors of forms in PETSc. They use the memory of the arrays that assembly fills, without a copy."""
+"""Matrices and vectors of forms in PETSc. They use the memory of the arrays that assembly fills, without a copy.
+
+On several ranks PETSc keeps columns that a rank owns apart from those of ghosts. It uses memory that is cut in this
+way, into which `changed` copies what assembly has made.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,8 @@ from thccs_fem.fem.blocks import BlockMatrix, Layout, constraints
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.linear import constrain
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import total
+from thccs_fem.subdivision import Ints
 
 __all__ = [
     "apply_lifting",
@@ -27,6 +33,7 @@ __all__ = [
     "changed",
     "comm_of",
     "new_block_mat",
+    "new_ghosted_vec",
     "new_mat",
     "new_vec",
     "set_bc",
@@ -76,6 +83,9 @@ def _(A: PETSc.Mat, form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
 def assemble_vector(form: Form | PETSc.Vec, added: Form | None = None, /) -> PETSc.Vec:
     """Return the vector of a form, ``assemble_vector(L)``, or add it to one, ``assemble_vector(b, L)``.
 
+    On several ranks it has ghosts, which are zero: its entries are complete, and a ``ghostUpdate`` of a script for
+    DOLFINx, which adds ghosts to them, does no harm.
+
     Args:
         form: Compiled form with a test function; or the vector that is added to.
         added: The form, if the vector came first.
@@ -85,10 +95,10 @@ def assemble_vector(form: Form | PETSc.Vec, added: Form | None = None, /) -> PET
         ValueError: The form has not one argument.
     """
     if isinstance(form, PETSc.Vec):
-        form.array_w[:] += assembly.assemble_vector(added)  # type: ignore[arg-type]  # it says what else is given
+        values = assembly.assemble_vector(added)  # type: ignore[arg-type]  # it says what else is given
+        form.array_w[:] += values[: form.getLocalSize()]
         return form
-    values = assembly.assemble_vector(form)
-    return new_vec(values, comm_of(form.spaces[0]))
+    return new_ghosted_vec(assembly.assemble_vector(form), form.spaces[0])
 
 
 def apply_lifting(
@@ -112,13 +122,14 @@ def apply_lifting(
     Raises:
         ValueError: A condition is on another space, or there are not as many of one thing as of the other.
     """
-    states = [x.array_r for x in x0] or [np.zeros(form.spaces[1].num_dofs) for form in a]
+    states = [x.array_r for x in x0] or [np.zeros(form.spaces[1].num_owned_dofs) for form in a]
     for form, conditions, state in zip(a, bcs, states, strict=True):
-        dofs, values = constraints(conditions, form.spaces[1])
-        if dofs.size:
-            g = np.zeros(state.size)
-            g[dofs] = values - state[dofs]
-            b.array_w[:] -= alpha * (assembly.assemble_matrix(form) @ g)
+        V = form.spaces[1]
+        dofs, values = constraints(conditions, V)
+        if total(V.mesh.comm, dofs.size):
+            jump = np.zeros(V.num_local_dofs)
+            jump[dofs] = values - Layout((V,)).with_ghosts(np.asarray(state, dtype=np.float64))[dofs]
+            b.array_w[:] -= alpha * (assembly.assemble_matrix(form) @ jump)
     return b
 
 
@@ -133,6 +144,8 @@ def set_bc(b: PETSc.Vec, bcs: Sequence[DirichletBC], x0: PETSc.Vec | None = None
     """
     if bcs:
         dofs, values = constraints(bcs, bcs[0].function_space)
+        owned = np.searchsorted(dofs, b.getLocalSize())
+        dofs, values = dofs[:owned], values[:owned]
         b.array_w[dofs] = alpha * (values if x0 is None else values - x0.array_r[dofs])
 
 
@@ -150,19 +163,30 @@ def comm_of(V: FunctionSpace) -> Any:  # petsc4py takes mpi4py's, but its stubs 
 
 
 def new_vec(array: Any, comm: Any) -> PETSc.Vec:
-    """Return a vector that uses the memory of an array."""
+    """Return a vector that uses the memory of an array; of several ranks the array of each is its part."""
     return PETSc.Vec().createWithArray(array, comm=comm)
+
+
+def new_ghosted_vec(array: Floats, V: FunctionSpace) -> PETSc.Vec:
+    """Return a vector that uses the memory of an array with ghosts, which become zero, shape (V.num_local_dofs,)."""
+    if V.index_map.is_whole:
+        return new_vec(array, comm_of(V))
+    array[V.num_owned_dofs :] = 0.0
+    ghosts: Any = V.index_map.ghosts.astype(PETSc.IntType)  # sequences, say the stubs
+    values: Any = array
+    size = V.num_owned_dofs, V.num_dofs
+    return PETSc.Vec().createGhostWithArray(ghosts, values, size=size, bsize=V.block_size, comm=comm_of(V))
 
 
 def new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
     """Return a matrix that uses the memory of A.
 
     Args:
-        A: The values.
+        A: The values, as `assembly.assemble_matrix` returns them.
         spaces: Spaces of rows and columns.
     """
     test, trial = spaces
-    mat = sharing(A, comm_of(test))
+    mat = sharing(A, comm_of(test), None if test.index_map.is_whole else Layout((trial,)).global_numbers)
     mat.setBlockSizes(test.block_size, trial.block_size)
     return mat
 
@@ -180,7 +204,9 @@ def new_block_mat(A: BlockMatrix | sp.csr_array, layout: Layout, kind: str = "mp
     """
     spaces, whole = layout.spaces, A.whole if isinstance(A, BlockMatrix) else A
     if kind == "mpi":
-        return new_mat(whole, (spaces[0], spaces[0])) if len(spaces) == 1 else sharing(whole, comm_of(spaces[0]))
+        if len(spaces) == 1:
+            return new_mat(whole, (spaces[0], spaces[0]))
+        return sharing(whole, comm_of(spaces[0]), None if layout.is_whole else layout.global_numbers)
     if kind != "nest" or not isinstance(A, BlockMatrix) or len(spaces) == 1:
         raise ValueError(f'kind is {kind!r}; it must be "mpi", or "nest" for several unknowns')
     A.scatter()
@@ -194,16 +220,42 @@ def new_block_mat(A: BlockMatrix | sp.csr_array, layout: Layout, kind: str = "mp
     return nest
 
 
-def sharing(A: sp.csr_array, comm: Any) -> PETSc.Mat:
-    """Return a matrix that uses the memory of A, of whatever dofs."""
+def sharing(A: sp.csr_array, comm: Any, columns: Ints | None = None, num_owned: int | None = None) -> PETSc.Mat:
+    """Return a matrix that uses the memory of A, of whatever dofs.
+
+    On several ranks it uses memory of its own, for entries in columns that this rank owns and for the others; `changed`
+    fills it with what is in A.
+
+    Args:
+        A: The values, on several ranks a row for each dof that this rank owns, columns sorted.
+        comm: Communicator.
+        columns: On several ranks PETSc's number of each column of A, owned ones first, the others ascending; None in
+            serial.
+        num_owned: How many columns this rank owns; None: as many as rows.
+    """
     if np.dtype(PETSc.ScalarType) != np.float64:
         raise TypeError(
             f"PETSc was built for {np.dtype(PETSc.ScalarType)}; forms here are real, double precision: use such a build"
         )
-    csr = (A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data)
-    mat = PETSc.Mat().createAIJWithArrays(A.shape, csr, comm=comm)
+    if columns is None:
+        mat = PETSc.Mat().createAIJWithArrays(A.shape, _csr(A.indptr, A.indices, A.data), comm=comm)
+        mat.setAttr("values", A)
+        return mat
+    num_owned = A.shape[0] if num_owned is None else num_owned
+    is_own = A.indices < num_owned
+    before = np.concatenate([[0], np.cumsum(is_own, dtype=np.int32)])[A.indptr]
+    own = _csr(before, A.indices[is_own], A.data[is_own])
+    others = _csr(A.indptr - before, columns[A.indices[~is_own]], A.data[~is_own])
+    size: Any = (A.shape[0], None), (num_owned, None)  # None: whatever it is, other than the stubs say
+    mat = PETSc.Mat().createAIJWithArrays(size, (own, others), comm=comm)
     mat.setAttr("values", A)
+    mat.setAttr("parts", (num_owned, own[2], others[2]))
     return mat
+
+
+def _csr(indptr: Ints, indices: Ints, data: Floats) -> Any:  # sequences, say the stubs
+    """Return arrays as PETSc takes them."""
+    return indptr.astype(PETSc.IntType, copy=False), indices.astype(PETSc.IntType, copy=False), data
 
 
 def changed(mat: PETSc.Mat) -> None:
@@ -217,5 +269,12 @@ def changed(mat: PETSc.Mat) -> None:
                 block = mat.getNestSubMatrix(i, j)
                 if block:
                     changed(block)
+    parts: Any = mat.getAttr("parts")
+    if parts is not None:
+        A: Any = mat.getAttr("values")
+        num_owned, own, others = parts
+        is_own = A.indices < num_owned
+        np.compress(is_own, A.data, out=own)
+        np.compress(~is_own, A.data, out=others)
     mat.assemble()
     mat.stateIncrease()
