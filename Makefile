@@ -13,8 +13,10 @@ ready := .venv/.ready
 demo: $(ready)
 	$(python) demos/laplace_on_surface.py
 
+# What runs on several ranks comes after the rest: ranks that wait keep their processors busy.
 test: $(ready)
-	$(python) -m pytest --numprocesses=auto --dist=loadfile
+	$(python) -m pytest --numprocesses=auto --dist=loadfile --ignore=tests/mpi
+	$(python) -m pytest tests/mpi
 
 lint: $(ready)
 	$(python) -m ruff check .

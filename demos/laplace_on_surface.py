@@ -18,18 +18,20 @@
 # a metal shell that is cooled at one end and heated at the other. The solution has kinks around the two patches, so a
 # uniform mesh would waste most of its unknowns: we refine where the residual says so, twenty times.
 #
-# Run it on a mesh of your own with `--mesh FILE` (OBJ, OFF, PLY, gmsh and what else meshio reads).
+# Run it on a mesh of your own with `--mesh FILE` (OBJ, OFF, PLY, gmsh and what else meshio reads), or on all
+# processors: `mpirun -n 4 python laplace_on_surface.py`.
 
 # %%
 import argparse
 import itertools
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
 
 import ufl
-from thccs_fem import adapt, estimate, fem, generators, io, mesh, plot, subdivision
+from thccs_fem import adapt, estimate, fem, generators, io, mesh, parallel, plot, subdivision
 from thccs_fem.forms import laplace_beltrami
 
 try:
@@ -49,10 +51,8 @@ parser.add_argument("--steps", type=int, default=int(os.environ.get("STEPS", "20
 parser.add_argument("--out", type=Path, default=Path("out"), help="directory of the results")
 arguments = parser.parse_args()
 
-if comm is not None and comm.size > 1:
-    if comm.rank == 0:
-        print(f"This demo is serial so far and was started on {comm.size} ranks: start it without mpirun.")
-    raise SystemExit(1)
+if parallel.rank_of(comm) > 0:
+    sys.stdout = None  # rank 0 prints for all
 
 # %% [markdown]
 # ## The control mesh and the two patches
@@ -63,10 +63,10 @@ if comm is not None and comm.size > 1:
 
 # %%
 if arguments.mesh is None:
-    msh = generators.genus3()
+    msh = generators.genus3(comm=comm)
     cold, hot = (np.flatnonzero(msh.face_tags == tag) for tag in (1, 2))
 else:
-    msh = io.read_mesh(arguments.mesh)
+    msh = io.read_mesh(arguments.mesh, comm)
     while msh.num_faces < 200 * msh.num_components:  # a coarse cage: subdivided, its limit surface is the same
         msh = subdivision.subdivided(msh)
     cold, hot = mesh.end_faces(msh)
@@ -95,7 +95,8 @@ def solve(V: fem.FunctionSpace) -> fem.Function:
     )
     uh = problem.solve()
     uh.name = "u"
-    energies.append(fem.assemble_scalar(fem.form(laplace_beltrami.a(uh, uh))))
+    energy = fem.assemble_scalar(fem.form(laplace_beltrami.a(uh, uh)))  # of the cells of this rank
+    energies.append(parallel.total(comm, energy))
     return uh
 
 

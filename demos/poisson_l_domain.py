@@ -18,22 +18,29 @@
 
 # %%
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import ufl
-from thccs_fem import adapt, estimate, fem, generators, plot
+from thccs_fem import adapt, estimate, fem, generators, parallel, plot
 from thccs_fem.forms import poisson
 
 try:
-    from mpi4py import MPI  # noqa: F401  # petsc4py wants it loaded
+    from mpi4py import MPI
 
     from thccs_fem.fem.petsc import LinearProblem
+
+    comm = MPI.COMM_WORLD
 except ImportError:  # no PETSc here: the same problem, solved by SciPy
     from thccs_fem.fem.scipy import LinearProblem
 
+    comm = None
+
+if parallel.rank_of(comm) > 0:
+    sys.stdout = None  # rank 0 prints for all
 steps = int(os.environ.get("STEPS", "20"))
 out = Path("out")
 out.mkdir(exist_ok=True)
@@ -44,7 +51,7 @@ out.mkdir(exist_ok=True)
 # `l_domain` tags its six corners, so that the smooth surface has them too.
 
 # %%
-msh = generators.l_domain(4)
+msh = generators.l_domain(4, comm=comm)
 f = fem.Constant(msh, 1.0)
 
 
@@ -86,8 +93,12 @@ def residual(uh: fem.Function) -> np.ndarray:
 ENERGY = 0.2140758026865
 
 
+def energy(uh: fem.Function) -> float:
+    return parallel.total(comm, fem.assemble_scalar(fem.form(poisson.a(uh, uh))))
+
+
 def with_energy(uh: fem.Function) -> np.ndarray:
-    energies.append(fem.assemble_scalar(fem.form(poisson.a(uh, uh))))
+    energies.append(energy(uh))
     return residual(uh)
 
 
@@ -106,7 +117,7 @@ estimated = np.array([step.estimate for step in history.steps])
 uniform = []
 for _ in range(min(steps, 4)):
     uh = solve(V)
-    uniform.append((V.num_dofs, np.sqrt(ENERGY - fem.assemble_scalar(fem.form(poisson.a(uh, uh))))))
+    uniform.append((V.num_dofs, np.sqrt(ENERGY - energy(uh))))
     V = adapt.refine(V, np.arange(V.num_functions))
 print("dofs", *(f"{n:.0f}" for n, _ in uniform), "error", *(f"{e:.1e}" for _, e in uniform))
 
@@ -129,7 +140,8 @@ axes.loglog(*np.transpose(uniform), ".--", color="tab:red", label="error, unifor
 axes.loglog(dofs, error[-1] * (dofs / dofs[-1]) ** -1.5, color="grey", lw=0.8, label="dofs$^{-3/2}$")
 axes.set(xlabel="dofs", ylabel="energy norm", title="A membrane over an L: cubic splines at their full rate")
 axes.legend()
-figure.savefig(out / "l_domain_convergence.png", dpi=150)
+if parallel.rank_of(comm) == 0:
+    figure.savefig(out / "l_domain_convergence.png", dpi=150)
 print(f"Wrote {out / 'l_domain_mesh.png'} and {out / 'l_domain_convergence.png'}")
 
 # %% [markdown]

@@ -26,18 +26,31 @@
 # %%
 import math
 import os
+import sys
 from pathlib import Path
 
 import ufl
-from thccs_fem import fem, generators, plot
-from thccs_fem.fem.scipy import LinearProblem
+from thccs_fem import fem, generators, parallel, plot
 from thccs_fem.forms import kirchhoff_love as shell
 from thccs_fem.mesh import ControlMesh
+
+try:
+    from mpi4py import MPI
+
+    from thccs_fem.fem.petsc import LinearProblem
+
+    comm = MPI.COMM_WORLD
+except ImportError:  # no PETSc here: the same problem, solved by SciPy
+    from thccs_fem.fem.scipy import LinearProblem
+
+    comm = None
 
 RADIUS, LENGTH, ANGLE, THICKNESS = 25.0, 50.0, math.radians(80), 0.25
 E, NU = 4.32e8, 0.0
 WEIGHT = 90.0  # per area
 steps = int(os.environ.get("STEPS", "4"))
+if parallel.rank_of(comm) > 0:
+    sys.stdout = None  # rank 0 prints for all
 
 # %% [markdown]
 # ## The midsurface
@@ -52,7 +65,7 @@ steps = int(os.environ.get("STEPS", "4"))
 # %%
 def roof(n: int) -> ControlMesh:
     upright = generators.cylinder((2 * n, n), RADIUS, LENGTH, ANGLE, rim=0.3)  # around z, the middle in direction x
-    lying = ControlMesh(upright.vertices[:, [1, 2, 0]], upright.quads)  # along y, the middle on top
+    lying = ControlMesh(upright.vertices[:, [1, 2, 0]], upright.quads, comm=comm)  # along y, the middle on top
     return generators.interpolated(lying)
 
 
@@ -73,6 +86,7 @@ def solve(n: int) -> fem.Function:
         shell.a(u, v, E, NU, THICKNESS),
         shell.L(fem.Constant(msh, [0.0, 0.0, -WEIGHT]), v),
         bcs=[fem.dirichletbc(0.0, ends, V.sub(component)) for component in (0, 2)],
+        petsc_options_prefix="roof_",
     )
     uh = problem.solve()
     uh.name = "displacement"

@@ -10,6 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 PATIENCE = 20.0  # seconds until a rank that waits for another has waited in vain
 
 
@@ -31,6 +33,15 @@ class Comm:
 
     def bcast(self, value: Any, root: int = 0) -> Any:
         return self.allgather(value)[root]
+
+    def alltoall(self, values: list[Any]) -> list[Any]:
+        return [given[self.rank] for given in self.allgather(values)]
+
+    def Alltoallv(self, sent: list[Any], received: list[Any]) -> None:
+        (values, counts), (result, expected) = sent, received
+        parts = self.alltoall(np.split(values.ravel(), np.cumsum(counts)[:-1]))
+        assert [part.size for part in parts] == expected.tolist()
+        result.ravel()[:] = np.concatenate(parts)
 
 
 def ranks(size: int) -> list[Comm]:

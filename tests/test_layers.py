@@ -8,18 +8,20 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = """
-    thccs_fem thccs_fem.absent thccs_fem.parallel thccs_fem.index_map thccs_fem.jit thccs_fem.element
+    thccs_fem thccs_fem.absent thccs_fem.parallel thccs_fem.index_map thccs_fem.jit thccs_fem.sparse thccs_fem.element
     thccs_fem.polygons thccs_fem.validation thccs_fem.mesh thccs_fem.positions
-    thccs_fem.subdivision thccs_fem.boundary thccs_fem.coarsening thccs_fem.bezier thccs_fem.limit thccs_fem.generators
+    thccs_fem.subdivision thccs_fem.boundary thccs_fem.joined thccs_fem.coarsening thccs_fem.bezier thccs_fem.limit thccs_fem.generators
     thccs_fem.stam thccs_fem.hierarchy thccs_fem.partition thccs_fem.prolongation thccs_fem.extraction thccs_fem.facets
     thccs_fem.quadrature thccs_fem.folds
     thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.expression thccs_fem.fem.checks thccs_fem.fem.forms
     thccs_fem.fem.sparsity thccs_fem.fem.loops thccs_fem.fem.mass
-    thccs_fem.fem.points thccs_fem.fem.entries thccs_fem.fem.assembly thccs_fem.fem.fitting thccs_fem.fem.bcs thccs_fem.fem.blocks
+    thccs_fem.fem.points thccs_fem.fem.entries thccs_fem.fem.assembly thccs_fem.fem.fitting thccs_fem.fem.bcs thccs_fem.fem.layout
+    thccs_fem.fem.blocks
     thccs_fem.fem.linear thccs_fem.fem.nonlinear thccs_fem.fem.eigen
     thccs_fem.fem.scipy.linear thccs_fem.fem.scipy.nonlinear thccs_fem.fem.scipy.eigen thccs_fem.fem.scipy
     thccs_fem.fem.project thccs_fem.fem
-    thccs_fem.fem.petsc.matrices thccs_fem.fem.petsc.multigrid thccs_fem.fem.petsc.options
+    thccs_fem.fem.levels thccs_fem.fem.petsc.matrices thccs_fem.fem.petsc.gauss_seidel thccs_fem.fem.petsc.multigrid
+    thccs_fem.fem.petsc.options
     thccs_fem.fem.petsc.linear thccs_fem.fem.petsc.nonlinear thccs_fem.fem.petsc.eigen
     thccs_fem.fem.petsc.evolution thccs_fem.fem.petsc.timestepping thccs_fem.fem.petsc
     thccs_fem.estimate thccs_fem.checkpoint thccs_fem.adapt thccs_fem.vtk thccs_fem.io thccs_fem.plot

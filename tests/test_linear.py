@@ -12,7 +12,7 @@ from zoo import ZOO
 
 import ufl
 from thccs_fem import adapt, fem, generators
-from thccs_fem.fem.blocks import Layout
+from thccs_fem.fem.layout import Layout
 from thccs_fem.fem.linear import (
     PRESCRIBED,
     VANISHING,

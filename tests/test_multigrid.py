@@ -1,9 +1,11 @@
 """Multigrid on the levels of spaces: prolongations and matrices against products, and how many iterations it takes."""
 
+import os
 import re
 import sys
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import scipy.sparse as sp
 from problems import graded_l_domain, refined_anywhere, refined_towards, uniformly_refined
 
 import ufl
-from thccs_fem import fem, generators
+from thccs_fem import fem, generators, io
 from thccs_fem.boundary import BoundaryRule
 from thccs_fem.fem.linear import constrain
 from thccs_fem.fem.space import FunctionSpace
@@ -24,8 +26,8 @@ pytest.importorskip("petsc4py")
 from petsc4py import PETSc
 
 from thccs_fem.fem import petsc
+from thccs_fem.fem.levels import Levels
 from thccs_fem.fem.petsc import multigrid
-from thccs_fem.fem.petsc.multigrid import Levels
 
 Form = Callable[[ufl.Argument, ufl.Argument], ufl.Form]
 
@@ -127,7 +129,7 @@ def test_matrices_are_galerkins_where_they_are_used(name: str) -> None:
     V = space(name)
     A = matrix(V, laplace_beltrami.a)
     levels = Levels.of(V)
-    found = levels.matrices(A)
+    found = [level.values for level in levels.matrices(A)]
     for l in reversed(range(len(found))):
         used = np.zeros(A.shape[0], dtype=bool)
         used[levels.smoothed[l]] = True
@@ -142,7 +144,7 @@ def test_matrices_are_galerkins_where_they_are_used(name: str) -> None:
 def test_work_does_not_grow_with_the_number_of_levels() -> None:
     for V in (graded_l_domain(5), graded_l_domain(15)):
         A = matrix(V, laplace_beltrami.a)
-        found = Levels.of(V).matrices(A)
+        found = [level.values for level in Levels.of(V).matrices(A)]
         assert sum(level.nnz for level in found) < 3.0 * A.nnz  # 2.4 and 2.2; of all functions 2.4 and 8
 
 
@@ -157,8 +159,8 @@ def test_a_function_that_only_the_truncation_changes_is_smoothed() -> None:
 
 # ---- Iterations ------------------------------------------------------------------------------------------------------
 
-# The aim: 12 for second order, 16 for fourth. Here it is 6 to 12, and 6 to 8.
-MOST = {"laplace": 12, "biharmonic": 12}
+# The aim: 12 for second order, 16 for fourth, whatever the number of dofs and levels. Here it is 6 to 12, and 5 to 8.
+MOST = {"laplace": 12, "biharmonic": 10}
 
 
 @pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: the solver is tested
@@ -176,7 +178,27 @@ def test_iterations(name: str, form: str) -> None:
 def test_the_clamped_plate() -> None:
     for V in (space("uniform square"), space("L-domain, 15 levels"), space("square, coarser meshes")):
         A = matrix(V, plate.a, slope=True)
-        assert solved(solver(V, as_mat(A)), A)[0] <= 12
+        assert solved(solver(V, as_mat(A)), A)[0] <= 10  # 5 and 9
+
+
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: the solver is tested
+@pytest.mark.skipif("THCCS_MESHES" not in os.environ, reason="THCCS_MESHES names no folder with meshes")
+@pytest.mark.parametrize("name", ["spot_control_mesh", "bob_control_mesh"])
+def test_meshes_as_people_have_them(name: str) -> None:
+    V = on(io.read_mesh(Path(os.environ["THCCS_MESHES"]) / f"{name}.obj"), 1)
+    A = matrix(V, biharmonic.a)
+    assert solved(solver(V, as_mat(A)), A)[0] <= 16  # 12 and 8; with two steps of smoothing 15 and 13
+
+
+@pytest.mark.filterwarnings("ignore:the form has second derivatives")  # on shallow caps: the solver is tested
+@pytest.mark.parametrize("name", ["finer square", "sphere, coarser meshes", "L-domain, 15 levels", "wheel 3"])
+@pytest.mark.parametrize(("form", "steps"), [("laplace", 2), ("biharmonic", 3)])
+def test_forms_of_fourth_order_take_a_third_step_of_smoothing(name: str, form: str, steps: int) -> None:
+    V = space(name)
+    A = matrix(V, FORMS[form])
+    ksp = solver(V, as_mat(A))
+    solved(ksp, A)
+    assert ksp.getPC().getMGSmoother(1).getTolerances()[3] == steps
 
 
 @pytest.mark.parametrize("times", [0, 2])

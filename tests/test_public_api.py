@@ -103,6 +103,8 @@ SIGNATURES = {
     "adapt.mark_coarsening": "V, eta, theta=0.05",
     "adapt.remesh": "V, marked, cells",
     "adapt.transfer": "u, V, projection='L2', *, conserve=False",
+    "checkpoint.write": "path, functions, attributes=None",
+    "checkpoint.read": "path, comm=None, *, mesh=None",
     "io.read_mesh": "filename, /, comm=None",
     "io.write_vtu": "filename, uh, /",
     "plot.plot": "uh, filename=None",

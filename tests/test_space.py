@@ -1,6 +1,5 @@
 """Function spaces: what they count, where their functions sit, which of them are the same."""
 
-
 import numpy as np
 import pytest
 from scipy.spatial import KDTree

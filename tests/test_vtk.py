@@ -161,7 +161,7 @@ def test_what_can_not_be_written(tmp_path: Path) -> None:
     V = space(mesh)
     u = some_function(V)
     file = tmp_path / "u.vtu"
-    with pytest.raises(ValueError, match=r"u\.vtk.*must end in \.vtu"):
+    with pytest.raises(ValueError, match=r"u\.vtk.*must end in \.vtu or \.pvtu"):
         vtk.write_vtu(tmp_path / "u.vtk", u)
     with pytest.raises(FileNotFoundError, match=r"no directory .*none.* make it first"):
         vtk.write_vtu(tmp_path / "none" / "u.vtu", u)
@@ -188,18 +188,52 @@ def test_what_can_not_be_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_other_types_and_names(tmp_path: Path) -> None:
+    V = space(ZOO["grid"]())
+    u = some_function(V, '<u> & "v"')  # what XML must hide
+    data = {"half": np.float16, "flag": bool, "small": np.int8, "big": ">f8", "long": np.int64}
+    given = {name: np.arange(V.num_cells).astype(dtype) for name, dtype in data.items()}
+    vtk.write_vtu(tmp_path / "u.vtu", u, cell_data=given)
+    grid = pyvista.read(tmp_path / "u.vtu")
+    assert grid.point_data.keys() == [u.name]
+    stored = {"half": np.float64, "flag": np.uint8, "small": np.int8, "big": np.float64, "long": np.int64}
+    for name, dtype in stored.items():
+        assert grid.cell_data[name].dtype == dtype
+        np.testing.assert_array_equal(grid.cell_data[name], given[name][grid.cell_data["cell"]])
+
+
+@pytest.mark.parametrize("name", ["u.vtu", "u.pvtu"])
+def test_what_is_written_in_parts_is_whole(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vtk, "CHUNK", 7)
+    V = space(ZOO["pyramid"]())
+    functions = [some_function(V), position(space(V.mesh, (3,)))]
+    eta = np.random.default_rng(5).random(V.num_cells)
+    vtk.write_vtu(tmp_path / name, functions, cell_data={"eta": eta})
+    read, made = pyvista.read(tmp_path / name), vtk.bezier_grid(functions, {"eta": eta})
+    np.testing.assert_array_equal(read.points, made.points)
+    np.testing.assert_array_equal(read.cell_connectivity, made.cell_connectivity)
+    for there, here in ((read.point_data, made.point_data), (read.cell_data, made.cell_data)):
+        assert there.keys() == here.keys()
+        for key in here.keys():
+            np.testing.assert_array_equal(there[key], here[key])
+    assert read.active_scalars_name == "u"
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def half(*_: object) -> None:
+    raise OSError("disk full")
+
+
 def test_older_file_stays_until_the_new_one_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "u.vtu"
     file.write_text("old")
     u = some_function(space(ZOO["torus"]()))
-
-    def half(grid: pyvista.UnstructuredGrid, draft: Path, path: Path) -> None:
-        draft.write_text("half")
-        raise OSError("disk full")
-
     with monkeypatch.context() as patch:
-        patch.setattr(vtk, "_save", half)
-        with pytest.raises(OSError, match="disk full"):
+        patch.setattr(vtk, "_write_data", half)
+        with pytest.raises(OSError, match=r"u\.vtu' could not be written \(disk full\): see that there is space"):
             vtk.write_vtu(file, u)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
     vtk.write_vtu(file, u)
@@ -210,10 +244,48 @@ def test_older_file_stays_until_the_new_one_is_complete(tmp_path: Path, monkeypa
     assert file.stat().st_mode == other.stat().st_mode
 
 
-def test_failure_of_vtk_is_reported(tmp_path: Path) -> None:
-    grid = vtk.bezier_grid(space(ZOO["torus"]()))
-    with (
-        pyvista.vtk_verbosity("off"),
-        pytest.raises(OSError, match=r"VTK could not write .*u\.vtu.*\(.*\): see that there is space"),
-    ):
-        vtk._save(grid, tmp_path / "none" / "u.vtu", tmp_path / "u.vtu")
+@pytest.mark.parametrize("fails", ["_write_data", "_write_index"])
+def test_older_index_keeps_its_pieces_until_the_new_one_is_complete(
+    fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, u = tmp_path / "u.pvtu", some_function(space(ZOO["torus"]()))
+    vtk.write_vtu(file, u)
+    assert names_in(tmp_path) == ["u.pvtu", "u_pieces0/u_0.vtu"]
+    before = u.x.array.copy()
+    for k in (1, 0):
+        first = pyvista.read(file).point_data["u"]
+        u.x.array = before + k
+        with monkeypatch.context() as patch:
+            patch.setattr(vtk, fails, half)
+            with pytest.raises(OSError, match="disk full"):
+                vtk.write_vtu(file, u)
+        assert names_in(tmp_path) == ["u.pvtu", f"u_pieces{1 - k}/u_0.vtu"]
+        np.testing.assert_array_equal(pyvista.read(file).point_data["u"], first)
+        vtk.write_vtu(file, u)
+        assert names_in(tmp_path) == ["u.pvtu", f"u_pieces{k}/u_0.vtu"]
+        np.testing.assert_array_equal(pyvista.read(file).point_data["u"], vtk.bezier_grid(u).point_data["u"])
+
+
+def test_files_of_others_stay_where_pieces_were(tmp_path: Path) -> None:
+    (tmp_path / "u_pieces0").mkdir()
+    (tmp_path / "u_pieces0" / "notes.txt").touch()
+    u = some_function(space(ZOO["torus"]()))
+    for _ in range(3):
+        vtk.write_vtu(tmp_path / "u.pvtu", u)
+    assert names_in(tmp_path) == ["u.pvtu", "u_pieces0/notes.txt", "u_pieces0/u_0.vtu"]
+
+
+@pytest.mark.parametrize("name", ["u.vtu", "u.pvtu"])
+def test_full_disk_is_reported(name: str, tmp_path: Path) -> None:
+    resource = pytest.importorskip("resource", reason="only Unix has limits of file sizes")
+    u = some_function(space(ZOO["torus"]()))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        with pytest.raises(
+            OSError, match=r"u.*\.vtu' could not be written \(File too large\): see that there is space"
+        ):
+            vtk.write_vtu(tmp_path / name, u)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert names_in(tmp_path) == []

@@ -15,7 +15,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from thccs_fem.boundary import Boundary, Triplets, summed
+from thccs_fem.boundary import Boundary
+from thccs_fem.sparse import Triplets, csr, entries, product, rows_of, summed
 from thccs_fem.subdivision import Ints, Level
 
 __all__ = ["bezier_masks", "spline_grid"]
@@ -39,83 +40,75 @@ def bezier_masks(boundary: Boundary, faces: Ints) -> sp.csr_array:
     """
     level = boundary.level
     half_edges = level.half_edges(faces)
-    inner = _face_corner_points(level, boundary.num_functions)
-    averages = _averages(level, half_edges)
-    rows = sp.csr_array(averages @ inner)
-    if level.rim.any():
-        rows = sp.csr_array(rows + _rim_rows(boundary, half_edges))
-    corner = np.arange(half_edges.size) % 4
-    face = np.arange(half_edges.size) // 4
+    shape = 4 * half_edges.size, boundary.num_functions
+    if not faces.size:
+        return sp.csr_array(shape)
+    used, averages = _averages(level, half_edges)
+    rows = product(averages, _face_corner_points(level, used, boundary.num_functions))
+    if level.rim[half_edges].any():
+        rows = summed([entries(rows), *_rim_rows(boundary, half_edges)], shape)
     # Row 4 * half-edges + (vertex, next, previous, face corner) as built, row 16 * face + place as wanted.
-    order = np.zeros(4 * half_edges.size, dtype=np.int64)
+    order = np.zeros((faces.size, 16), dtype=np.int32)
     for kind, place in enumerate((VERTEX_PLACE, EDGE_PLACE_NEXT, EDGE_PLACE_PREVIOUS, FACE_PLACE)):
-        order[16 * face + place[corner]] = 4 * np.arange(half_edges.size) + kind
-    return rows[order]
+        order[:, place] = 4 * np.arange(half_edges.size).reshape(-1, 4) + kind
+    return rows_of(rows, order.ravel())
 
 
-def _face_corner_points(level: Level, num_functions: int) -> sp.csr_array:
-    """Return the masks I of all half-edges, shape (num_half_edges, num_functions)."""
-    n = np.where(level.boundary, 4.0, level.vertex_num_faces)[level.vertices]
-    following, previous = level.following, level.previous
-    columns = np.stack(
-        [
-            level.vertices,
-            level.vertices[following],
-            level.vertices[following[following]],
-            level.vertices[previous],
-        ],
-        axis=1,
-    )
+def _face_corner_points(level: Level, half_edges: Ints, num_functions: int) -> sp.csr_array:
+    """Return the masks I of half-edges, shape (n, num_functions)."""
+    opposite = level.following[level.following[half_edges]]
+    columns = level.vertices[
+        np.stack([half_edges, level.following[half_edges], opposite, level.previous[half_edges]], axis=1)
+    ]
+    start = level.vertices[half_edges]
+    n = np.where(level.boundary[start], 4.0, level.vertex_num_faces[start])
     weights = np.stack([n, np.full_like(n, 2.0), np.ones_like(n), np.full_like(n, 2.0)], axis=1) / (n + 5.0)[:, None]
     indptr = np.arange(0, 4 * n.size + 1, 4, dtype=np.int32)
-    return sp.csr_array((weights.ravel(), columns.ravel(), indptr), shape=(n.size, num_functions))
+    return csr(weights.ravel(), columns.ravel(), indptr, (n.size, num_functions))
 
 
-def _averages(level: Level, half_edges: Ints) -> sp.csr_array:
-    """Return the means of I that are no boundary rows, shape (4 * n, num_half_edges); for `bezier_masks`."""
-    row = 4 * np.arange(half_edges.size)
+def _averages(level: Level, half_edges: Ints) -> tuple[Ints, sp.csr_array]:
+    """Return half-edges, and the means of their I that are no boundary rows, shape (4 * n, number of these)."""
+    row = 4 * np.arange(half_edges.size, dtype=np.int32)
     previous = level.previous[half_edges]
     across, across_previous = level.twins[half_edges], level.twins[previous]
     next_inside, previous_inside = ~level.rim[half_edges], ~level.rim[previous]
     other_next = level.following[across]  # starts at the same vertex, in the face across the edge
     interior = ~level.boundary[level.vertices[half_edges]]
     around, count = _fans(level, level.vertices[half_edges[interior]])
-    rows = [
-        np.repeat(row[interior], count),
-        row[next_inside] + 1,
-        row[next_inside] + 1,
-        row[previous_inside] + 2,
-        row[previous_inside] + 2,
-        row + 3,
+    triplets: Triplets = [
+        (np.repeat(row[interior], count), around, np.repeat(1.0 / np.maximum(count, 1), count)),
+        (row[next_inside] + 1, half_edges[next_inside], 0.5),
+        (row[next_inside] + 1, other_next[next_inside], 0.5),
+        (row[previous_inside] + 2, half_edges[previous_inside], 0.5),
+        (row[previous_inside] + 2, across_previous[previous_inside], 0.5),
+        (row + 3, half_edges, 1.0),
     ]
-    columns = [
-        around,
-        half_edges[next_inside],
-        other_next[next_inside],
-        half_edges[previous_inside],
-        across_previous[previous_inside],
-        half_edges,
-    ]
-    values = [np.repeat(1.0 / np.maximum(count, 1), count)]
-    values += [np.full(r.size, weight) for r, weight in zip(rows[1:], (0.5, 0.5, 0.5, 0.5, 1.0), strict=True)]
-    return sp.csr_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(4 * half_edges.size, level.vertices.size),
-    )
+    marks = np.zeros(level.vertices.size, dtype=bool)
+    for _, columns, _ in triplets:
+        marks[columns] = True
+    used = np.flatnonzero(marks).astype(np.int32)
+    number = np.zeros(level.vertices.size, dtype=np.int32)
+    number[used] = np.arange(used.size, dtype=np.int32)
+    shape = 4 * half_edges.size, used.size
+    return used, summed([(rows, number[columns], values) for rows, columns, values in triplets], shape)
 
 
 def _fans(level: Level, vertices: Ints) -> tuple[Ints, Ints]:
     """Return the half-edges that start at each vertex, one list, and how many belong to each."""
-    order = np.argsort(level.vertices, kind="stable").astype(np.int32)
-    ends = np.cumsum(np.bincount(level.vertices, minlength=level.num_vertices))
-    count = np.diff(ends, prepend=0)
-    first = np.repeat((ends - count)[vertices], count[vertices])
-    total = np.cumsum(count[vertices])
-    return order[first + np.arange(first.size) - np.repeat(total - count[vertices], count[vertices])], count[vertices]
+    wanted = np.zeros(level.num_vertices, dtype=bool)
+    wanted[vertices] = True
+    starts = np.flatnonzero(wanted[level.vertices]).astype(np.int32)
+    order = starts[np.argsort(level.vertices[starts], kind="stable")]
+    count = np.bincount(level.vertices[starts], minlength=level.num_vertices).astype(np.int32)
+    begin = (np.cumsum(count) - count)[vertices]
+    count = count[vertices]
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return order[np.repeat(begin, count) + within], count
 
 
-def _rim_rows(boundary: Boundary, half_edges: Ints) -> sp.csr_array:
-    """Return the boundary rows: the crease masks applied to P + delta / 6, shape (4 * n, num_functions)."""
+def _rim_rows(boundary: Boundary, half_edges: Ints) -> Triplets:
+    """Return the boundary rows: the crease masks applied to P + delta / 6, rows 4 * half-edges + kind."""
     level = boundary.level
     triplets = _rim_vertex_rows(boundary, half_edges)
     row = 4 * np.arange(half_edges.size)
@@ -129,7 +122,7 @@ def _rim_rows(boundary: Boundary, half_edges: Ints) -> sp.csr_array:
         on = level.rim[edge]
         r, a, b = row[on] + kind, start[on], neighbour[on]
         triplets += [(r, a, 2 / 3), (r, b, 1 / 3), (r, own[a], 1 / 9), (r, other[b], 1 / 18)]
-    return summed(triplets, (4 * half_edges.size, boundary.num_functions))
+    return triplets
 
 
 def _rim_vertex_rows(boundary: Boundary, half_edges: Ints) -> Triplets:

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from thccs_fem.sparse import Triplets, entries, product, summed
 from thccs_fem.subdivision import Bools, Ints, Level, Step
 
 __all__ = [
@@ -32,7 +33,6 @@ __all__ = [
     "BoundaryRule",
     "from_dofs",
     "subdivision_matrix",
-    "summed",
     "support_of_traces",
     "to_dofs",
     "traces_meeting",
@@ -44,7 +44,6 @@ SMOOTH, CORNER_OUT, CORNER_IN, CORNER_MIXED = 0, 1, 2, 3  # kinds of trace funct
 TIED_ZONE = 1  # edges along the rim from an irregular vertex within which delta is 0
 
 Floats = npt.NDArray[np.float64]
-Triplets = list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer], Floats | float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,22 +124,9 @@ class Boundary:
         return np.where(trace >= 0, trace, vertex)
 
 
-def summed(triplets: Triplets, shape: tuple[int, int]) -> sp.csr_array:
-    """Sum (rows, columns, values) into a matrix; negative rows or columns (tied deltas) are dropped."""
-    rows = np.concatenate([np.asarray(r, dtype=np.int64) for r, _, _ in triplets])
-    columns = np.concatenate([np.asarray(c, dtype=np.int64) for _, c, _ in triplets])
-    values = np.concatenate([np.broadcast_to(np.asarray(v, dtype=float), np.shape(r)) for r, _, v in triplets])
-    keep = (rows >= 0) & (columns >= 0)
-    return sp.csr_array((values[keep], (rows[keep], columns[keep])), shape=shape)
-
-
 def subdivision_matrix(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_array:
     """Return the subdivision matrix of (P, delta), shape (fine.num_functions, coarse.num_functions)."""
     shape = (fine.num_functions, coarse.num_functions)
-    indptr = np.concatenate([step.matrix.indptr, np.full(fine.vertex.size, step.matrix.indptr[-1])])
-    vertices = sp.csr_array((step.matrix.data, step.matrix.indices, indptr), shape=shape)
-    if not coarse.vertex.size:
-        return vertices
     level = coarse.level
     fine_of_old = np.full(level.num_vertices, -1, dtype=np.int32)
     fine_of_old[step.old] = np.arange(step.old.size, dtype=np.int32)
@@ -148,12 +134,12 @@ def subdivision_matrix(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_a
     edges = step.edges[on_rim]
     a, b = level.vertices[edges], level.vertices[level.following[edges]]
     point = (step.old.size + on_rim).astype(np.int32)
-    triplets: Triplets = []
+    triplets: Triplets = [entries(step.matrix)]
     for side in (coarse.out_side[a], coarse.in_side[b]):
         triplets += [(point, side, 1 / 16), (fine.first[point], side, 1 / 8)]
     triplets += _old_rim_rows(coarse, fine, fine_of_old, a, b)
     triplets += _old_corner_rows(coarse, fine, fine_of_old)
-    return sp.csr_array(vertices + summed(triplets, shape))
+    return summed(triplets, shape)
 
 
 def _old_rim_rows(coarse: Boundary, fine: Boundary, fine_of_old: Ints, a: Ints, b: Ints) -> Triplets:
@@ -212,7 +198,7 @@ def to_dofs(boundary: Boundary) -> sp.csr_array:
 
 def from_dofs(boundary: Boundary) -> sp.csr_array:
     """Return T, the matrix that takes q to (P, delta), shape (num_functions, num_functions)."""
-    size, num_vertices = boundary.num_functions, boundary.level.num_vertices
+    size = boundary.num_functions
     if not boundary.vertex.size:
         return sp.eye_array(size, format="csr")
     points = _points_from_dofs(boundary)
@@ -230,8 +216,7 @@ def from_dofs(boundary: Boundary) -> sp.csr_array:
     of_points += [(q00, c, 36.0)]
     for neighbour, side in ((x1, boundary.in_side[x1]), (y1, boundary.out_side[y1])):
         of_dofs += [(q00, boundary.trace_or_vertex(side, neighbour), 18.0)]
-    shape = (size, num_vertices)
-    return sp.csr_array(points + summed(of_dofs, (size, size)) + summed(of_points, shape) @ points[:num_vertices])
+    return summed([entries(points), *of_dofs, entries(product(summed(of_points, (size, size)), points))], (size, size))
 
 
 def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
@@ -241,20 +226,18 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
     across_free = np.isin(w, v)  # a strip one face wide: both of its rims are free
     c = boundary.corner_faces[:, 0]
     others = np.setdiff1d(np.arange(boundary.level.num_vertices, dtype=np.int32), boundary.vertex)
-    rims = summed(
-        [
-            (others, others, 1.0),
-            (v, v, np.where(across_free, 2.0, 1.5)),
-            (v, w, np.where(across_free, -1.0, -0.5)),
-        ],
-        (size, size),
-    )
+    rims: Triplets = [
+        (others, others, 1.0),
+        (v, v, np.where(across_free, 2.0, 1.5)),
+        (v, w, np.where(across_free, -1.0, -0.5)),
+    ]
     corners: Triplets = [(c, c, 2.25)]
     around: Triplets = [
         (c, neighbour, weight)
         for neighbour, weight in zip(boundary.corner_faces.T[1:], (-0.5, -0.25, -0.5), strict=True)
     ]
-    return sp.csr_array(rims + summed(corners, (size, size)) + summed(around, (size, size)) @ rims)
+    of_rims = product(summed(around, (size, size)), summed(rims, (size, size)))
+    return summed([*rims, *corners, entries(of_rims)], (size, size))
 
 
 def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:

@@ -42,8 +42,8 @@ import scipy.sparse as sp
 import basix.ufl
 from thccs_fem import element
 from thccs_fem.extraction import Cells
-from thccs_fem.fem.blocks import Layout
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Layout
 from thccs_fem.fem.petsc.matrices import comm_of, sharing
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.subdivision import Ints
@@ -146,8 +146,7 @@ def extraction_matrix(V: FunctionSpace) -> PETSc.Mat:
     C = sp.csr_array((local @ V.cells.rows(pieces(V)))[node_of_dof])
     C = sp.csr_array(sp.kron(C, sp.eye_array(V.block_size), format="csr"))
     C.sort_indices()
-    columns = None if V.index_map.is_whole else Layout((V,)).global_numbers
-    mat = sharing(C, comm_of(V), columns, V.num_owned_dofs)
+    mat = sharing(C, comm_of(V), Layout((V,)).numbering)
     mat.setBlockSizes(V.block_size, V.block_size)
     return mat
 

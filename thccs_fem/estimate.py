@@ -1,6 +1,7 @@
 """Error indicators, one a cell: the exact error, the residual of the strong form, and local problems on bubbles.
 
-Indicators are not squared; `norm` sums them up.
+Indicators are not squared; `norm` sums them up. On several ranks each has those of the cells that it owns; all
+functions are collective.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from thccs_fem.fem.assembly import assemble_cells, bubble_energies
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import gathered, total
 
 __all__ = ["bubble", "error", "norm", "residual"]
 
@@ -37,7 +39,7 @@ def error(
         norm: "L2", or "H1" (the full norm: values and gradients along the surface).
 
     Returns:
-        Shape (num_cells,), local.
+        Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
         ValueError: If the norm is unknown.
@@ -85,7 +87,7 @@ def residual(
         flux: The vector (of a system: the tensor) whose normal part must not jump.
 
     Returns:
-        Shape (num_cells,), local.
+        Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
         ValueError: If an expression has functions on finer cells, or an edge tag is unknown.
@@ -128,7 +130,7 @@ def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
         L: Linear form in a test function of that space. Bubbles do not see integrals over edges.
 
     Returns:
-        Shape (num_cells,), local.
+        Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
         ValueError: If forms and uh have different spaces, functions on finer cells, or second derivatives of the test
@@ -137,14 +139,20 @@ def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
     V, a, L = uh.function_space, form(a), form(L)
     _check_problem(V, a, L)
     squares = np.abs(bubble_energies(a, L, uh))
-    singular = np.flatnonzero(np.isinf(squares))
-    if singular.size:
+    _check_solved(V, np.flatnonzero(np.isinf(squares)))
+    return np.sqrt(squares)
+
+
+def _check_solved(V: FunctionSpace, singular: npt.NDArray[np.integer]) -> None:
+    numbers = V.cells.partition.cells.numbers[singular]
+    found = gathered(V.mesh.comm, np.stack([numbers, V.cells.face[singular]], axis=1))
+    if found.size:
+        cell, face = found[np.argmin(found[:, 0])]
         raise ValueError(
-            f"the local problems of {singular.size} cells have no solution, the first that of cell {singular[0]} on "
-            f"face {V.cells.face[singular[0]]} of the control mesh: L has an integral there, or one of a component, "
+            f"the local problems of {len(found)} cells have no solution, the first that of cell {cell} on "
+            f"face {face} of the control mesh: L has an integral there, or one of a component, "
             f"that a has none of, or the coefficients of a are zero"
         )
-    return np.sqrt(squares)
 
 
 def _check_problem(V: FunctionSpace, a: Form, L: Form) -> None:
@@ -167,8 +175,8 @@ def _check_problem(V: FunctionSpace, a: Form, L: Form) -> None:
 
 
 def norm(V: FunctionSpace, eta: Floats) -> float:
-    """Return the root of the sum of the squared indicators, over all ranks."""
-    return float(np.sqrt(np.sum(np.asarray(eta) ** 2)))
+    """Return the root of the sum of the squared indicators, over all ranks; collective."""
+    return float(np.sqrt(total(V.mesh.comm, np.sum(np.asarray(eta) ** 2))))
 
 
 def _tangential(V: FunctionSpace, gradient: Expr) -> Expr:
@@ -184,7 +192,7 @@ def _tangential(V: FunctionSpace, gradient: Expr) -> Expr:
 
 
 def _over_cells(V: FunctionSpace, density: Expr, measure: ufl.Measure = ufl.dx) -> Floats:
-    """Return the integral of a density over each cell of V, or its edges, shape (num_cells,).
+    """Return the integral of a density over each cell of V, or its edges, shape (cells.num_owned,).
 
     Raises:
         ValueError: If the density has functions on finer cells than those of V.

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,11 @@ from thccs_fem import element, jit
 from thccs_fem.bezier import bezier_masks, spline_grid
 from thccs_fem.hierarchy import Hierarchy, Stage
 from thccs_fem.index_map import IndexMap
+from thccs_fem.joined import Parts, groups, joined_boundaries
 from thccs_fem.limit import evaluate_patches
 from thccs_fem.partition import Partition, needed_functions, partition
 from thccs_fem.positions import CHILD_AXES, CHILD_ORIGIN, child_at, side_points
+from thccs_fem.sparse import first_rows, product, rows_of, stacked, summed
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["Batch", "Cells", "Rows", "evaluate_pieces", "extract"]
@@ -210,8 +213,9 @@ class Cells:
         Returns:
             Shape (n, m).
         """
+        control = self.piece_points[pieces].reshape(pieces.size, 4, 4, self.points.shape[1])
         du, dv = (
-            np.einsum("qj,qi,njic->nqc", v, u, self.piece_points[pieces].reshape(pieces.size, 4, 4, -1))
+            np.einsum("qj,qi,njic->nqc", v, u, control)
             for u, v in (
                 (element.bspline_slopes(uv[:, 0]), element.bspline_values(uv[:, 1])),
                 (element.bspline_values(uv[:, 0]), element.bspline_slopes(uv[:, 1])),
@@ -274,13 +278,40 @@ def evaluate_pieces(local: Floats, piece: Ints, uv: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pieces:
-    """Pieces of one level, before they are sorted into batches."""
+class _Places:
+    """Where the faces of one level lie, as far as they are parts of cells."""
 
+    cell: Ints  # -1: of none
+    origin: Floats
+    axes: Floats
+
+    @classmethod
+    def none(cls, num_faces: int) -> _Places:
+        """Return places of faces that are parts of no cells."""
+        return cls(np.full(num_faces, -1, dtype=np.int32), np.zeros((num_faces, 2)), np.zeros((num_faces, 2, 2)))
+
+    def of_children(self, stage: Stage) -> _Places:
+        """Return the places of the faces of the next level: in the cell of the parent where it was cut, else none."""
+        assert stage.step is not None
+        result = _Places.none(stage.step.fine.num_faces)
+        parent = np.flatnonzero(stage.cut)
+        child = stage.step.first_child[parent, None] + np.arange(4)
+        axes = self.axes[parent, None]
+        result.cell[child] = self.cell[parent, None]
+        result.origin[child] = self.origin[parent, None] + (axes @ CHILD_ORIGIN[..., None])[..., 0]
+        result.axes[child] = axes @ CHILD_AXES / 2.0
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Pieces of some levels, before they are sorted into batches."""
+
+    level: Ints
     cell: Ints
     face: Ints
     nodes: Ints  # rows of points and of coefficients, 16 a piece
-    points: Floats  # the control vertices of the level, then the points of pieces that are not regular
+    points: Floats  # the control vertices of the levels, then the points of pieces that are not regular
     coefficients: tuple[sp.csr_array, sp.csr_array]  # both in terms of the dofs
     origin: Floats
     axes: Floats
@@ -297,12 +328,13 @@ def extract(hierarchy: Hierarchy, parts: Partition | None = None) -> Cells:
     numbers = parts.cells.numbers
     level, level_face, face = (of_all[numbers] for of_all in _active_elements(hierarchy))
     pieces = _all_pieces(hierarchy, parts)
-    piece_level = np.repeat(np.arange(len(pieces)), [p.cell.size for p in pieces])
+    piece_level = np.concatenate([p.level for p in pieces])
+    piece_face = np.concatenate([p.face for p in pieces])
     first_node = np.cumsum([0, *(len(p.points) for p in pieces[:-1])])
     nodes = np.concatenate([first + p.nodes for first, p in zip(first_node, pieces, strict=True)]).astype(np.int32)
     points = np.concatenate([p.points for p in pieces])
     cell = np.concatenate([p.cell for p in pieces])
-    coefficients = sp.csr_array(sp.vstack([part for p in pieces for part in p.coefficients], format="csr"))
+    coefficients = stacked([part for p in pieces for part in p.coefficients])
     if not parts.cells.is_whole:
         nodes, points, coefficients = _without_unused(nodes, points, coefficients)
         coefficients = _in_local_dofs(coefficients, parts.functions)
@@ -320,8 +352,12 @@ def extract(hierarchy: Hierarchy, parts: Partition | None = None) -> Cells:
         piece_origin=np.concatenate([p.origin for p in pieces])[order],
         piece_axes=np.concatenate([p.axes for p in pieces])[order],
         piece_of_face=tuple(
-            _scattered(stage.level.num_faces, p.face, place[piece_level == m])
-            for m, (stage, p) in enumerate(zip(hierarchy.stages, pieces, strict=True))
+            _scattered(stage.level.num_faces, piece_face[first:end], place[first:end])
+            for stage, (first, end) in zip(
+                hierarchy.stages,
+                pairwise(np.searchsorted(piece_level, np.arange(len(hierarchy.stages) + 1))),
+                strict=True,
+            )
         ),
     )
 
@@ -338,7 +374,7 @@ def _without_unused(nodes: Ints, points: Floats, coefficients: sp.csr_array) -> 
     used = np.zeros(len(points), dtype=bool)
     used[nodes] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return number[nodes], points[used], sp.csr_array(coefficients[np.flatnonzero(used)])
+    return number[nodes], points[used], rows_of(coefficients, np.flatnonzero(used))
 
 
 def _in_local_dofs(coefficients: sp.csr_array, functions: IndexMap) -> sp.csr_array:
@@ -363,25 +399,24 @@ def _active_elements(hierarchy: Hierarchy) -> tuple[Ints, Ints, Ints]:
 
 
 def _all_pieces(hierarchy: Hierarchy, parts: Partition) -> list[_Pieces]:
-    """Return the pieces of each stage: active faces that are not cut, and the ends of the cuts."""
-    pieces = []
-    first_cell = 0
-    cell = origin = axes = None
+    """Return the pieces, level by level: active faces that are not cut, and the ends of the cuts."""
     numbers = parts.cells.numbers
     local = _scattered(parts.cells.size_global, numbers, np.arange(numbers.size, dtype=np.int32))
     coefficients = _all_coefficients(hierarchy, parts, local >= 0)
-    for l, stage in enumerate(hierarchy.stages):
+    places, first_cell = [], 0
+    of_level = _Places.none(hierarchy.root.num_faces)
+    for stage in hierarchy.stages:
         faces = stage.active_faces
-        if cell is None or origin is None or axes is None:
-            cell, origin, axes = _untouched(stage.level.num_faces)
-        cell[faces] = local[first_cell : first_cell + faces.size]
-        origin[faces], axes[faces] = 0.0, np.eye(2)
+        of_level.cell[faces] = local[first_cell : first_cell + faces.size]
+        of_level.origin[faces], of_level.axes[faces] = 0.0, np.eye(2)
         first_cell += faces.size
-        at = np.flatnonzero((cell >= 0) & ~stage.cut).astype(np.int32)
-        pieces.append(_pieces(hierarchy, l, coefficients[l], at, cell[at], origin[at], axes[at]))
+        places.append(of_level)
         if stage.step is not None:
-            cell, origin, axes = _carried_to_children(stage, cell, origin, axes)
-    return pieces
+            of_level = of_level.of_children(stage)
+    return [
+        _pieces(hierarchy, range(len(places))[group], places[group], coefficients[group])
+        for group in groups([stage.level.num_faces for stage in hierarchy.stages])
+    ]
 
 
 def _all_coefficients(hierarchy: Hierarchy, parts: Partition, cells: Bools) -> Sequence[sp.csr_array]:
@@ -391,52 +426,51 @@ def _all_coefficients(hierarchy: Hierarchy, parts: Partition, cells: Bools) -> S
     return hierarchy.coefficient_rows(needed_functions(hierarchy, cells))
 
 
-def _untouched(num_faces: int) -> tuple[Ints, Floats, Floats]:
-    return np.full(num_faces, -1, dtype=np.int32), np.zeros((num_faces, 2)), np.zeros((num_faces, 2, 2))
-
-
-def _carried_to_children(stage: Stage, cell: Ints, origin: Floats, axes: Floats) -> tuple[Ints, Floats, Floats]:
-    """Return cell, origin and axes of the faces of the next level: those of the parent where it was cut, else none."""
-    assert stage.step is not None
-    carried = _untouched(stage.step.fine.num_faces)
-    parent = np.flatnonzero(stage.cut)
-    for k in range(4):
-        child = stage.step.first_child[parent] + k
-        carried[0][child] = cell[parent]
-        carried[1][child] = origin[parent] + axes[parent] @ CHILD_ORIGIN[k]
-        carried[2][child] = axes[parent] @ CHILD_AXES[k] / 2.0
-    return carried
-
-
 def _pieces(
-    hierarchy: Hierarchy, l: int, of_dofs: sp.csr_array, faces: Ints, cell: Ints, origin: Floats, axes: Floats
+    hierarchy: Hierarchy, levels: Sequence[int], places: Sequence[_Places], of_dofs: Sequence[sp.csr_array]
 ) -> _Pieces:
-    """Return the pieces that the given faces of stage l are.
+    """Return the pieces of some levels.
 
     Regular interior faces read their 4 x 4 control vertices; all others, caps included, go through the Bezier masks.
     """
-    stage = hierarchy.stages[l]
-    level, points = stage.level, hierarchy.points[l]
-    coefficients = sp.csr_array(stage.boundary.to_points @ of_dofs)
-    plain = level.regular & ~level.boundary
-    regular = plain[level.quads[faces]].all(axis=1)
-    grid = spline_grid(level, faces[regular])
-    masks = bezier_masks(stage.boundary, faces[~regular])
-    num_masked = np.count_nonzero(~regular)
-    to_spline = sp.kron(sp.eye_array(num_masked, format="csr"), sp.csr_array(element.TO_BSPLINE), format="csr")
-    masked = sp.csr_array(to_spline @ sp.csr_array(masks @ coefficients))
+    stages = [hierarchy.stages[l] for l in levels]
+    ends = [np.flatnonzero((p.cell >= 0) & ~s.cut).astype(np.int32) for p, s in zip(places, stages, strict=True)]
+    boundary = joined_boundaries([stage.boundary for stage in stages])
+    level = boundary.level
+    of_faces = Parts.of([stage.level.num_faces for stage in stages])
+    of_vertices = Parts.of([stage.level.num_vertices for stage in stages])
+    faces = np.concatenate([end + first for end, first in zip(ends, of_faces.starts, strict=False)])
+    coefficients = of_vertices.functions(boundary).joined_rows(of_dofs)
+    if boundary.vertex.size:
+        coefficients = product(boundary.to_points, coefficients)
+    regular = (level.regular & ~level.boundary)[level.quads[faces]].all(axis=1)
+    masks = bezier_masks(boundary, faces[~regular])
+    num_masked = int(np.count_nonzero(~regular))
+    to_spline = _diagonal_blocks(element.TO_BSPLINE, num_masked)
+    points = np.concatenate([hierarchy.points[l] for l in levels])
+    control = np.concatenate([points, np.zeros((boundary.vertex.size, points.shape[1]))])  # the surface has no delta
     nodes = np.zeros((faces.size, 16), dtype=np.int32)
-    nodes[regular] = grid
+    nodes[regular] = spline_grid(level, faces[regular])
     nodes[~regular] = level.num_vertices + np.arange(16 * num_masked).reshape(-1, 16)
     return _Pieces(
-        cell=cell,
-        face=faces,
+        level=of_faces.level[faces] + np.int32(levels[0]),
+        cell=np.concatenate([p.cell[end] for p, end in zip(places, ends, strict=True)]),
+        face=np.concatenate(ends),
         nodes=nodes,
-        points=np.concatenate([points, to_spline @ (masks[:, : level.num_vertices] @ points)]),
-        coefficients=(sp.csr_array(coefficients[: level.num_vertices]), masked),
-        origin=origin,
-        axes=axes,
+        points=np.concatenate([points, to_spline @ (masks @ control)]),
+        coefficients=(first_rows(coefficients, level.num_vertices), product(to_spline, product(masks, coefficients))),
+        origin=np.concatenate([p.origin[end] for p, end in zip(places, ends, strict=True)]),
+        axes=np.concatenate([p.axes[end] for p, end in zip(places, ends, strict=True)]),
     )
+
+
+def _diagonal_blocks(block: Floats, count: int) -> sp.csr_array:
+    """Return the matrix with copies of a square matrix on its diagonal."""
+    rows, columns = np.nonzero(block)
+    first = block.shape[0] * np.arange(count, dtype=np.int32)[:, None]
+    size = count * block.shape[0]
+    copies = (first + rows).ravel(), (first + columns).ravel(), np.tile(block[rows, columns], count)
+    return summed([copies], (size, size))
 
 
 def _batches(cell: Ints, nodes: Ints, coefficients: sp.csr_array) -> tuple[tuple[Batch, ...], Ints]:

@@ -14,6 +14,7 @@ from thccs_fem import element
 from thccs_fem.bezier import bezier_masks
 from thccs_fem.boundary import Boundary
 from thccs_fem.extraction import Cells
+from thccs_fem.parallel import gathered
 from thccs_fem.subdivision import Ints, Level, neighbourhood, subdivide
 
 __all__ = ["check_no_folds"]
@@ -25,11 +26,15 @@ Floats = npt.NDArray[np.float64]
 
 
 def check_no_folds(cells: Cells) -> None:
-    """Raise ValueError where a planar surface folds, naming faces of the control mesh; others always pass."""
+    """Raise ValueError where a planar surface folds, naming faces of the control mesh; others always pass. Collective.
+
+    Each rank looks at the cells that it owns and, since they are few, at all tagged corners.
+    """
     mesh = cells.hierarchy.mesh
     if mesh.gdim != 2:
         return
-    folded = np.unique(cells.face[cells.piece_cell[_folds(element.TO_BERNSTEIN @ cells.piece_points)]])
+    cell = cells.piece_cell[_folds(element.TO_BERNSTEIN @ cells.piece_points)]
+    folded = np.unique(gathered(mesh.comm, cells.face[cell[cell < cells.num_owned]]))
     if folded.size:
         raise ValueError(
             f"the planar surface folds (det J <= 0) on {folded.size} of {mesh.num_faces} faces, first "

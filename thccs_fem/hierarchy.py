@@ -37,9 +37,22 @@ from thccs_fem.boundary import (
     to_dofs,
     traces_meeting,
 )
+from thccs_fem.joined import Parts, groups, joined_levels
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.positions import in_quads, in_sub_quads
-from thccs_fem.subdivision import Bools, Ints, Level, Step, control_level, neighbourhood, subdivide
+from thccs_fem.sparse import COMPUTED, EMPTY, csr, product, rows_of, stacked
+from thccs_fem.subdivision import (
+    Bools,
+    Children,
+    Ints,
+    Level,
+    Step,
+    children,
+    control_level,
+    neighbourhood,
+    subdivide,
+    with_matrix,
+)
 
 __all__ = ["CAP_LEVEL", "Hierarchy", "Stage", "faces_meeting", "functions_meeting"]
 
@@ -122,12 +135,22 @@ class Hierarchy:
 
     @classmethod
     def _build(
-        cls, mesh: ControlMesh, rule: BoundaryRule, cap_level: int, refined_keys: Sequence[Keys], root: Level
+        cls,
+        mesh: ControlMesh,
+        rule: BoundaryRule,
+        cap_level: int,
+        refined_keys: Sequence[Keys],
+        root: Level,
+        known: Sequence[Stage] = (),
     ) -> Self:
         keys = tuple(k for k in refined_keys if k.size)
         caps = _cap_levels(root, keys, cap_level)
         _check_depth(root, max(int(caps.max()), len(keys)))
-        return cls(mesh, rule, cap_level, keys, root, tuple(_stages(root, rule, keys, caps)))
+        return cls(mesh, rule, cap_level, keys, root, tuple(_stages(root, rule, keys, caps, known)))
+
+    def _with(self, refined_keys: Sequence[Keys], cap_level: int) -> Self:
+        """Return the hierarchy with other faces refined; it shares the stages in which nothing changes."""
+        return self._build(self.mesh, self.rule, cap_level, refined_keys, self.root, self.stages)
 
     @property
     def num_levels(self) -> int:
@@ -198,14 +221,8 @@ class Hierarchy:
 
     def support(self, dofs: npt.NDArray[np.integer]) -> tuple[Bools, ...]:
         """Return, for each level, the faces in the support of those given dofs that belong to the level."""
-        marked = np.zeros(self.num_dofs, dtype=bool)
-        marked[dofs] = True
-        supports = []
-        for l, stage in enumerate(self.stages[: self.num_levels]):
-            functions = stage.active.copy()
-            functions[stage.active] = marked[self.dof_offsets[l] : self.dof_offsets[l + 1]]
-            supports.append(faces_meeting(stage.boundary, functions))
-        return tuple(supports)
+        functions = self._functions_of(dofs)
+        return tuple(faces_meeting(stage.boundary, marks) for stage, marks in zip(self.stages, functions, strict=False))
 
     def refined(self, dofs: npt.NDArray[np.integer]) -> Self:
         """Return the hierarchy in which the supports of the given dofs are refined once more (sec. 4.1).
@@ -253,7 +270,7 @@ class Hierarchy:
             keys.append(stage.level.keys[cover | (along & cover.any())])
         if _same_keys(keys, self.refined_keys):
             return self
-        return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
+        return self._with(keys, self.cap_level)
 
     def _marks_of(self, cells: npt.NDArray[np.integer]) -> list[Bools]:
         """Return marks of the given cells on the faces of each level."""
@@ -285,7 +302,7 @@ class Hierarchy:
         keys = [np.union1d(ours, theirs) for ours, theirs in pairs]
         if _same_keys(keys, self.refined_keys):
             return self
-        return self._build(self.mesh, self.rule, self.cap_level, keys, self.root)
+        return self._with(keys, self.cap_level)
 
     def with_caps_at(self, cap_level: int) -> Self:
         """Return the hierarchy with another least cap level; the dofs stay as they are.
@@ -294,13 +311,13 @@ class Hierarchy:
             ValueError: If the level is less than 1.
         """
         _check_cap_level(cap_level)
-        return self._build(self.mesh, self.rule, cap_level, self.refined_keys, self.root)
+        return self._with(self.refined_keys, cap_level)
 
     def truncated_to(self, num_levels: int) -> Self:
         """Return the hierarchy with Omega^num_levels and everything finer emptied; num_levels is 1 or more."""
         if num_levels < 1:
             raise ValueError(f"num_levels is {num_levels}; level 0 is always there: give 1 or more")
-        return self._build(self.mesh, self.rule, self.cap_level, self.refined_keys[: num_levels - 1], self.root)
+        return self._with(self.refined_keys[: num_levels - 1], self.cap_level)
 
     def is_refinement_of(self, other: Hierarchy) -> bool:
         """Return whether every function of `other` is a function of this hierarchy."""
@@ -311,10 +328,14 @@ class Hierarchy:
             and all(np.isin(o, k).all() for k, o in zip(self.refined_keys, other.refined_keys, strict=False))
         )
 
-    def prolongation(self, coarse: Hierarchy) -> sp.csr_array:
+    def prolongation(self, coarse: Hierarchy, dofs: Ints | None = None) -> sp.csr_array:
         """Return the exact transfer from a coarser hierarchy, shape (num_dofs, coarse.num_dofs).
 
         Truncation preserves coefficients: the row of dof (l, i) is row i of the coarse hierarchy's C_l.
+
+        Args:
+            coarse: The other one.
+            dofs: Those whose rows are wanted, in any order; None: all.
 
         Raises:
             ValueError: If this hierarchy is no refinement of `coarse`.
@@ -325,9 +346,21 @@ class Hierarchy:
                 "the same control mesh with the same boundary rule; use fem.project to carry a function between "
                 "unrelated spaces"
             )
-        carried = _coefficients(self.stages[: self.num_levels], coarse.stages)
-        rows = [c[self.dof_functions(l)] for l, c in enumerate(carried)]
-        return sp.csr_array(sp.vstack(rows, format="csr"))
+        stages = self.stages[: self.num_levels]
+        needed = None if dofs is None else _with_sources(stages, self._functions_of(dofs))
+        carried = _coefficients(stages, coarse.stages, needed)
+        rows = stacked([rows_of(c, self.dof_functions(l)) for l, c in enumerate(carried)])
+        return rows if dofs is None else rows_of(rows, dofs)
+
+    def _functions_of(self, dofs: npt.NDArray[np.integer]) -> list[Bools]:
+        """Return marks of the functions of each level that the given dofs are."""
+        marked = np.zeros(self.num_dofs, dtype=bool)
+        marked[dofs] = True
+        functions = []
+        for stage, of_level in zip(self.stages, np.split(marked, self.dof_offsets[1:-1]), strict=False):
+            functions.append(np.zeros_like(stage.active))
+            functions[-1][stage.active] = of_level
+        return functions
 
     def same_as(self, other: Hierarchy) -> bool:
         """Return whether both describe the same functions."""
@@ -378,28 +411,117 @@ def _cap_levels(root: Level, refined_keys: Sequence[Keys], least: int) -> Ints:
     return caps
 
 
-def _stages(root: Level, rule: BoundaryRule, refined_keys: Sequence[Keys], caps: Ints) -> list[Stage]:
-    """Return the stages from level 0 to that of the deepest piece."""
-    stages: list[Stage] = []
-    level, boundary = root, Boundary.of(root, rule)
-    inside = np.ones(root.num_faces, dtype=bool)
+@dataclass(frozen=True, eq=False)
+class _Outline:
+    """The faces of one level of a hierarchy and their children: a `Stage` before its functions are known."""
+
+    level: Level
+    inside: Bools
+    refined: Bools
+    cut: Bools
+    divided: Bools  # faces with children
+    children: Children | None
+
+    def is_of(self, stage: Stage) -> bool:
+        """Return whether a stage is that of these faces."""
+        ours, theirs = (self.inside, self.refined, self.cut), (stage.inside, stage.refined, stage.cut)
+        return self.level is stage.level and all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+
+def _stages(
+    root: Level, rule: BoundaryRule, refined_keys: Sequence[Keys], caps: Ints, known: Sequence[Stage]
+) -> list[Stage]:
+    """Return the stages from level 0 to that of the deepest piece.
+
+    Which faces a level has determines all of it, whatever coarser levels hold beside them; and a stage is determined by
+    its level and the marks on it. Both are taken over where they are `known`, from a hierarchy of this root and rule.
+    """
+    outlines: list[_Outline | Stage] = []
+    level, inside = root, np.ones(root.num_faces, dtype=bool)
     held = inside  # faces of Omega^l and children of cut faces
     while True:
+        before = known[level.number] if level.number < len(known) else None
         keys = refined_keys[level.number] if level.number < len(refined_keys) else np.zeros(0, dtype=np.int64)
         refined = np.isin(level.keys, keys, assume_unique=True) & inside
         cut = held & ~refined & _needs_cut(level, caps)
-        selected = ~functions_meeting(boundary, ~inside)
-        active = selected & functions_meeting(boundary, ~refined)
-        opened = refined | cut
-        if not opened.any():
-            stages.append(Stage(level, boundary, inside, refined, cut, None, None, selected, active))
-            return stages
-        step = subdivide(level, neighbourhood(level, opened))
-        fine = Boundary.of(step.fine, rule)
-        matrix = _dof_step(boundary, fine, step)
-        stages.append(Stage(level, boundary, inside, refined, cut, step, matrix, selected, active))
-        inside, held = _children(step, refined), _children(step, opened)
-        level, boundary = step.fine, fine
+        outline = _outline(level, inside, refined, cut, before)
+        outlines.append(before if before is not None and outline.is_of(before) else outline)
+        if outline.children is None:
+            return _with_functions(outlines, rule)
+        inside, held = (_children(outline.children, faces) for faces in (refined, refined | cut))
+        level = outline.children.fine
+
+
+def _outline(level: Level, inside: Bools, refined: Bools, cut: Bools, before: Stage | None) -> _Outline:
+    """Return the faces of a level with their children: those of the stage `before` where they are the same."""
+    opened = refined | cut
+    if not opened.any():
+        return _Outline(level, inside, refined, cut, opened, None)
+    divided = neighbourhood(level, opened)
+    fine = None
+    if before is not None and before.step is not None:
+        if before.level is level and np.array_equal(divided, before.step.first_child >= 0):
+            return _Outline(level, inside, refined, cut, divided, before.step)
+        if np.array_equal(level.keys[divided], before.level.keys[before.step.first_child >= 0]):
+            fine = before.step.fine
+    return _Outline(level, inside, refined, cut, divided, children(level, divided, fine))
+
+
+def _with_functions(outlines: Sequence[_Outline | Stage], rule: BoundaryRule) -> list[Stage]:
+    """Return the stages of outlines, among stages that stay as they are."""
+    unknown = [outline for outline in outlines if isinstance(outline, _Outline)]
+    sizes = [outline.level.num_faces for outline in unknown]
+    made = iter([stage for group in groups(sizes) for stage in _made(unknown[group], rule)])
+    return [next(made) if isinstance(outline, _Outline) else outline for outline in outlines]
+
+
+def _made(outlines: Sequence[_Outline], rule: BoundaryRule) -> list[Stage]:
+    """Return the stages of outlines, all at once."""
+    inside, refined, divided = (
+        np.concatenate([getattr(outline, name) for outline in outlines]) for name in ("inside", "refined", "divided")
+    )
+    levels = [outline.level for outline in outlines]
+    vertices = Parts.of([level.num_vertices for level in levels])
+    boundary = Boundary.of(joined_levels(levels), rule)
+    functions = vertices.functions(boundary)
+    selected = ~functions_meeting(boundary, ~inside)
+    active = selected & functions_meeting(boundary, ~refined)
+    found = zip(
+        outlines,
+        vertices.split_boundary(boundary, levels),
+        _steps(outlines, rule, boundary, divided, vertices),
+        functions.split(selected),
+        functions.split(active),
+        strict=True,
+    )
+    return [Stage(o.level, traces, o.inside, o.refined, o.cut, *step, *marks) for o, traces, step, *marks in found]
+
+
+def _steps(
+    outlines: Sequence[_Outline], rule: BoundaryRule, boundary: Boundary, divided: Bools, vertices: Parts
+) -> list[tuple[Step, sp.csr_array] | tuple[None, None]]:
+    """Return the step of each level, and S_l in terms of the dof functions; for `_made`."""
+    if not divided.any():
+        return [(None, None)] * len(outlines)
+    made = [outline.children for outline in outlines]
+    level = boundary.level
+    step = with_matrix(level, divided, made[0] if len(made) == 1 and made[0] else children(level, divided))
+    fine = Boundary.of(step.fine, rule)
+    kinds = [(m.old.size, m.edges.size, np.count_nonzero(m.first_child >= 0)) if m else (0, 0, 0) for m in made]
+    fine_vertices = Parts.of(*zip(*kinds, strict=True))
+    plain = fine_vertices.split_rows(step.matrix, vertices)
+    matrices = plain
+    if boundary.vertex.size or fine.vertex.size:
+        matrix = product(product(to_dofs(fine), subdivision_matrix(boundary, fine, step)), boundary.to_points)
+        matrices = fine_vertices.functions(fine).split_rows(matrix, vertices.functions(boundary))
+    result: list[tuple[Step, sp.csr_array] | tuple[None, None]] = []
+    for m, s, matrix in zip(made, plain, matrices, strict=True):
+        if m is None:
+            result.append((None, None))
+        else:  # without traces both matrices are the same
+            step = Step(m.fine, m.first_child, m.old, m.edges, s)
+            result.append((step, s if s.shape == matrix.shape else matrix))
+    return result
 
 
 def _needs_cut(level: Level, caps: Ints) -> Bools:
@@ -409,18 +531,11 @@ def _needs_cut(level: Level, caps: Ints) -> Bools:
     return level.touching(ends_later)
 
 
-def _children(step: Step, faces: Bools) -> Bools:
+def _children(step: Children, faces: Bools) -> Bools:
     """Return the children of the marked quads, as marks on the fine level."""
     marks = np.zeros(step.fine.num_faces, dtype=bool)
     marks[(step.first_child[faces][:, None] + np.arange(4)).ravel()] = True
     return marks
-
-
-def _dof_step(coarse: Boundary, fine: Boundary, step: Step) -> sp.csr_array:
-    """Return T_{l+1}^-1 S_l T_l."""
-    if not coarse.vertex.size and not fine.vertex.size:
-        return step.matrix
-    return sp.csr_array(to_dofs(fine) @ subdivision_matrix(coarse, fine, step) @ coarse.to_points)
 
 
 def functions_meeting(boundary: Boundary, faces: Bools) -> Bools:
@@ -498,6 +613,21 @@ def _cheapest(level: Level, vertices: npt.NDArray[np.integer], left: Bools, unwa
     return np.unique(vertices[order[best[left & (best < order.size)]]]).astype(np.int32)
 
 
+def _with_sources(stages: Sequence[Stage], functions: Sequence[Bools]) -> list[Bools]:
+    """Return marks of functions and of all on coarser levels whose coefficients theirs are made of, before truncation.
+
+    Args:
+        stages: The first ones of a hierarchy.
+        functions: Marks for each of them.
+    """
+    result = [marks.copy() for marks in functions]
+    for l in range(len(result) - 1, 0, -1):
+        matrix = stages[l - 1].matrix
+        assert matrix is not None  # every stage but the last has a step
+        result[l - 1][rows_of(matrix, np.flatnonzero(result[l])).indices] = True
+    return result
+
+
 def _coefficients(
     stages: Sequence[Stage], of: Sequence[Stage], needed: Sequence[Bools] | None = None
 ) -> list[sp.csr_array]:
@@ -510,23 +640,28 @@ def _coefficients(
     result: list[sp.csr_array] = []
     first = 0
     for l, stage in enumerate(stages):
-        size = stage.boundary.num_functions
-        selected, active = _functions_on(stage, of[l]) if l < len(of) else (np.zeros(0, dtype=np.int32),) * 2
-        columns = first + np.arange(active.size)
-        first += active.size
+        unit = np.full(stage.boundary.num_functions, COMPUTED, dtype=np.int32)
+        if l < len(of):
+            selected, active = _functions_on(stage, of[l])
+            unit[selected] = EMPTY  # the truncation
+            unit[active] = np.arange(first, first + active.size, dtype=np.int32)
+            first += active.size
         if needed is not None:
-            active, columns = active[needed[l][active]], columns[needed[l][active]]
-        unit = sp.csr_array((np.ones(active.size), (active, columns)), shape=(size, num_dofs))
-        if l == 0:
-            result.append(unit)
+            unit[~needed[l]] = EMPTY
+        if l == 0:  # all functions are selected
+            result.append(_units(unit, num_dofs))
             continue
         matrix = stages[l - 1].matrix
         assert matrix is not None  # every stage but the last has a step
-        kept = np.ones(size) if needed is None else needed[l].astype(np.float64)
-        kept[selected] = 0.0  # the truncation
-        result.append(sp.csr_array(sp.diags_array(kept, format="csr") @ (matrix @ result[-1]) + unit))
-        result[-1].eliminate_zeros()
+        result.append(product(matrix, result[-1], unit))
     return result
+
+
+def _units(column: Ints, num_columns: int) -> sp.csr_array:
+    """Return the matrix that has a 1 in the given column of each row; EMPTY: a row without."""
+    used = column >= 0
+    indptr = np.concatenate([[0], np.cumsum(used)]).astype(np.int32)
+    return csr(np.ones(indptr[-1]), column[used], indptr, (column.size, num_columns))
 
 
 def _functions_on(stage: Stage, other: Stage) -> tuple[Ints, Ints]:

@@ -640,3 +640,98 @@ void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t
     }
   }
 }
+
+/* ---- Sparse matrices ------------------------------------------------------------------------------------------- */
+
+/* Sort a row by columns, equal ones in the order they have: rows are short. */
+static void sort_row(int32_t n, int32_t *indices, double *data)
+{
+  for (int32_t k = 1; k < n; ++k) {
+    const int32_t column = indices[k];
+    const double value = data[k];
+    int32_t j = k;
+    for (; j > 0 && indices[j - 1] > column; --j) {
+      indices[j] = indices[j - 1];
+      data[j] = data[j - 1];
+    }
+    indices[j] = column;
+    data[j] = value;
+  }
+}
+
+void thccs_sum_triplets(int64_t n, const int32_t *rows, const int32_t *columns, const double *values,
+                        int32_t num_rows, int32_t *indptr, int32_t *indices, double *data)
+{
+  /* Row i begins at indptr[i + 1] until its entries are there, and then ends there. */
+  for (int64_t k = 0; k < n; ++k)
+    if (rows[k] >= 0 && columns[k] >= 0 && rows[k] + 2 <= num_rows)
+      ++indptr[rows[k] + 2];
+  for (int32_t i = 2; i <= num_rows; ++i)
+    indptr[i] += indptr[i - 1];
+  for (int64_t k = 0; k < n; ++k)
+    if (rows[k] >= 0 && columns[k] >= 0) {
+      const int32_t to = indptr[rows[k] + 1]++;
+      indices[to] = columns[k];
+      data[to] = values[k];
+    }
+  int32_t size = 0;
+  for (int32_t i = 0, begin = 0; i < num_rows; ++i) {
+    const int32_t end = indptr[i + 1], first = size;
+    sort_row(end - begin, indices + begin, data + begin);
+    for (int32_t k = begin; k < end; ++k)
+      if (size > first && indices[size - 1] == indices[k])
+        data[size - 1] += data[k];
+      else {
+        indices[size] = indices[k];
+        data[size++] = data[k];
+      }
+    indptr[i + 1] = size;
+    begin = end;
+  }
+}
+
+void thccs_product(int32_t num_rows, const int32_t *a_indptr, const int32_t *a_indices, const double *a_data,
+                   const int32_t *b_indptr, const int32_t *b_indices, const double *b_data, const int32_t *unit,
+                   int32_t *place, int32_t *indptr, int32_t *indices, double *data)
+{
+  int32_t size = 0;
+  for (int32_t i = 0; i < num_rows; ++i) {
+    const int32_t first = size;
+    if (unit && unit[i] >= 0) {
+      indices[size] = unit[i];
+      data[size++] = 1.0;
+    }
+    const int32_t end = unit && unit[i] != -1 ? a_indptr[i] : a_indptr[i + 1];
+    for (int32_t k = a_indptr[i]; k < end; ++k)
+      for (int32_t m = b_indptr[a_indices[k]]; m < b_indptr[a_indices[k] + 1]; ++m) {
+        const int32_t column = b_indices[m];
+        if (place[column] < first) {
+          place[column] = size;
+          indices[size] = column;
+          data[size++] = a_data[k] * b_data[m];
+        } else
+          data[place[column]] += a_data[k] * b_data[m];
+      }
+    int32_t kept = first;
+    for (int32_t k = first; k < size; ++k) {
+      place[indices[k]] = -1;
+      if (data[k] != 0.0) {
+        indices[kept] = indices[k];
+        data[kept++] = data[k];
+      }
+    }
+    size = kept;
+    sort_row(size - first, indices + first, data + first);
+    indptr[i + 1] = size;
+  }
+}
+
+void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, const int32_t *a_indices,
+                const double *a_data, const int32_t *indptr, int32_t *indices, double *data)
+{
+  for (int32_t i = 0; i < num_rows; ++i) {
+    const int32_t begin = a_indptr[rows[i]], size = indptr[i + 1] - indptr[i];
+    memcpy(indices + indptr[i], a_indices + begin, size * sizeof *indices);
+    memcpy(data + indptr[i], a_data + begin, size * sizeof *data);
+  }
+}

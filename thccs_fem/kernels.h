@@ -106,3 +106,18 @@ void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32
 void thccs_dense_rows(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
                       const int32_t *indices, const double *data, const int32_t *offsets, const int32_t *columns,
                       const int32_t *width, const int64_t *starts, int32_t *place, double *values);
+
+/* The matrix (num_rows rows) of the sums of n triplets, columns ascending; those with a negative row or column are
+   dropped. indptr (num_rows + 1) is 0 before; indices and data have n places, of which indptr[num_rows] are used. */
+void thccs_sum_triplets(int64_t n, const int32_t *rows, const int32_t *columns, const double *values,
+                        int32_t num_rows, int32_t *indptr, int32_t *indices, double *data);
+
+/* The product of two CSR matrices, columns ascending, without zeros. unit, or NULL: -1 for a row of the product, -2 for
+   an empty row, else the column in which there is a 1. place (columns of b) is -1 before. */
+void thccs_product(int32_t num_rows, const int32_t *a_indptr, const int32_t *a_indices, const double *a_data,
+                   const int32_t *b_indptr, const int32_t *b_indices, const double *b_data, const int32_t *unit,
+                   int32_t *place, int32_t *indptr, int32_t *indices, double *data);
+
+/* Rows of a CSR matrix, in the given order; indptr is that of the result. */
+void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, const int32_t *a_indices,
+                const double *a_data, const int32_t *indptr, int32_t *indices, double *data);

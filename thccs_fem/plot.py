@@ -3,6 +3,8 @@
 Every bicubic piece is sampled here on a grid of n x n facets, with exact points, normals and values.  Linear
 interpolation on n segments errs by at most 0.75 / n^2 times the largest second difference of Bernstein coefficients.
 This gives n: no facet strays from the surface, and no gap opens between pieces, by as much as one could see.
+
+On several ranks each gets the whole surface, from all of them, and rank 0 draws.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,12 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from thccs_fem import element
-from thccs_fem.extraction import Cells
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import by_first_rank, together, total
 from thccs_fem.positions import side_points
-from thccs_fem.subdivision import Ints
-from thccs_fem.vtk import cell_numbers, in_space, one_for_each_cell
+from thccs_fem.subdivision import Bools, Ints
+from thccs_fem.vtk import cell_numbers, in_space, of_all_ranks, one_for_each_cell
 
 if TYPE_CHECKING:  # imported where it is needed: it takes its time
     import pyvista
@@ -62,13 +65,14 @@ def plot(
     warp: float = 0.0,
     window_size: tuple[int, int] = (1600, 1200),
 ) -> None:
-    """Draw a function, or only the elements of a space, on the limit surface.
+    """Draw a function, or only the elements of a space, on the limit surface; collective, and rank 0 draws.
 
     Args:
         uh: A function (of one with vector values the magnitude is drawn), or a space.
         filename: PNG file to write, also on a machine without a display; None opens a window.
-        cell_data: Colour the elements by this instead: one name and the values for each of them, such as estimates, of
-            shape (num_cells,). On a scale of powers of ten: {"log10 of the error": np.log10(eta)}.
+        cell_data: Colour the elements by this instead: one name and the values for each of them that this rank owns,
+            such as estimates, of shape (cells.num_owned,), which is (num_cells,) in serial. On a scale of powers of
+            ten: {"log10 of the error": np.log10(eta)}.
         camera: Camera position as PyVista takes it: "xy", "iso", ..., a direction towards the viewer, or (position,
             focal point, up). By default planar surfaces are seen from above, others obliquely with z upwards.
         clim: Values at the ends of the colour map; by default the least and the largest there are.
@@ -87,31 +91,36 @@ def plot(
     """
     import pyvista
 
-    path = None if filename is None else _checked(Path(filename))
+    comm = _space(uh).mesh.comm
+    path = None if filename is None else by_first_rank(comm, lambda: _checked(Path(filename)))
     shown = _shown(uh, cell_data)
     facets, sides = surface(uh, warp=warp), mesh_lines(uh, warp=warp) if lines else None
-    with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
-        plotter: Any = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
-    try:
-        _check_there_is_something_to_draw_on(plotter)
-        plotter.set_background("white")
-        plotter.enable_anti_aliasing("ssaa")
-        if shown is None:
-            _draw(plotter, facets, sides, {"color": PLAIN}, {"color": INK})
-        else:
-            _draw_coloured(plotter, shown, facets, sides, clim, cmap)
-        _set_camera(plotter, facets.points, camera, 0.0 if shown is None else BAR)
-        if path is None:
-            plotter.show()
-        else:
-            plotter.screenshot(path)
-    finally:
-        if path is not None:  # else show() has closed it, unless it lives on in a notebook
-            plotter.close()
+
+    def draw() -> None:
+        with pyvista.vtk_verbosity("off"):  # it would complain of every kind of display that it doesn't find
+            plotter: Any = pyvista.Plotter(off_screen=path is not None or None, window_size=list(window_size))
+        try:
+            _check_there_is_something_to_draw_on(plotter)
+            plotter.set_background("white")
+            plotter.enable_anti_aliasing("ssaa")
+            if shown is None:
+                _draw(plotter, facets, sides, {"color": PLAIN}, {"color": INK})
+            else:
+                _draw_coloured(plotter, shown, facets, sides, clim, cmap)
+            _set_camera(plotter, facets.points, camera, 0.0 if shown is None else BAR)
+            if path is None:
+                plotter.show()
+            else:
+                plotter.screenshot(path)
+        finally:
+            if path is not None:  # else show() has closed it, unless it lives on in a notebook
+                plotter.close()
+
+    by_first_rank(comm, draw)
 
 
 def surface(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyData:
-    """Return the limit surface as facets, for pictures of one's own.
+    """Return the limit surface as facets, for pictures of one's own; collective, and the whole of it on every rank.
 
     Point data are the normals and, by its name, the function; cell data are the numbers of `vtk.cell_numbers`. Pieces
     share no points.
@@ -126,16 +135,16 @@ def surface(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyD
     """
     import pyvista
 
-    cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
+    drawn = _pieces(uh, warp)
     points, normals, sampled, facets, piece = [], [], [], [], []
     num_points = 0
-    for n, pieces in _by_segments(points_of_pieces, values):
+    for n, pieces in _by_segments(drawn.points, drawn.values):
         t = np.linspace(0.0, 1.0, n + 1)
         along, slopes = element.bspline_values(t), element.bspline_slopes(t)
-        local = points_of_pieces[pieces]
+        local = drawn.points[pieces]
         points.append(_on_grid(along, along, local))
         normals.append(_normals(_on_grid(slopes, along, local), _on_grid(along, slopes, local)))
-        sampled.append(_on_grid(along, along, values[pieces]))
+        sampled.append(_on_grid(along, along, drawn.values[pieces]))
         facets.append(num_points + _grid_facets(pieces.size, n))
         piece.append(np.repeat(pieces, n * n))
         num_points += len(points[-1])
@@ -144,13 +153,13 @@ def surface(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyD
     mesh.point_data.active_normals = np.concatenate(normals)
     _add_values(mesh, uh, np.concatenate(sampled))
     piece_of_facet = np.concatenate(piece)
-    for name, numbers in cell_numbers(cells).items():
+    for name, numbers in drawn.numbers.items():
         mesh.cell_data[name] = numbers[piece_of_facet]
     return mesh
 
 
 def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.PolyData:
-    """Return the sides of the elements as lines along the facets of `surface`; elements share no lines.
+    """Return the sides of the elements as lines along the facets of `surface`; elements share no lines. Collective.
 
     Point data are the function, by its name; cell data the number "cell" of the element.
 
@@ -163,18 +172,17 @@ def mesh_lines(uh: Function | FunctionSpace, *, warp: float = 0.0) -> pyvista.Po
     """
     import pyvista
 
-    cells, points_of_pieces, values = _cells_points_and_values(uh, warp)
-    outer = cells.on_cell_edges
+    drawn = _pieces(uh, warp)
     points, sampled, lines, cell = [], [], [], []
     num_points = 0
-    for n, pieces in _by_segments(points_of_pieces, values):
-        piece, side = np.nonzero(outer[pieces])
-        on_sides = _on_sides(n)[side]
-        points.append((on_sides @ points_of_pieces[pieces[piece]]).reshape(-1, points_of_pieces.shape[2]))
-        sampled.append((on_sides @ values[pieces[piece]]).reshape(-1, values.shape[2]))
+    for n, pieces in _by_segments(drawn.points, drawn.values):
+        k, side = np.nonzero(drawn.on_cell_edges[pieces])
+        piece, on_sides = pieces[k], _on_sides(n)[side]
+        points.append((on_sides @ drawn.points[piece]).reshape(-1, drawn.points.shape[2]))
+        sampled.append((on_sides @ drawn.values[piece]).reshape(-1, drawn.values.shape[2]))
         number = num_points + np.arange(len(points[-1])).reshape(-1, n + 1)
         lines.append(np.insert(number, 0, n + 1, axis=1).ravel())
-        cell.append(cells.piece_cell[pieces[piece]])
+        cell.append(drawn.numbers["cell"][piece])
         num_points += number.size
     mesh = pyvista.PolyData(in_space(np.concatenate(points)), lines=np.concatenate(lines))
     _add_values(mesh, uh, np.concatenate(sampled))
@@ -187,27 +195,58 @@ def _add_values(mesh: pyvista.PolyData, uh: Function | FunctionSpace, values: Fl
         mesh.point_data[uh.name] = values if uh.function_space.value_shape else values[:, 0]
 
 
-def _cells_and_values(uh: Function | FunctionSpace) -> tuple[Cells, Floats]:
-    """Return cells and local B-spline coefficients of the values, shape (num_pieces, 16, k); zero for a space."""
-    if isinstance(uh, FunctionSpace):
-        return uh.cells, np.zeros((uh.cells.num_pieces, element.NUM_FUNCTIONS, 1))
-    if not isinstance(uh, Function):
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """What is drawn: the pieces of all ranks.
+
+    Attributes:
+        points: Local B-spline coefficients of the points, shape (num_pieces, 16, 2 or 3).
+        values: Those of the values, shape (num_pieces, 16, k); zero for a space.
+        on_cell_edges: Which sides lie on the edges of cells, shape (num_pieces, 4).
+        numbers: Those of `vtk.cell_numbers`.
+    """
+
+    points: Floats
+    values: Floats
+    on_cell_edges: Bools
+    numbers: Mapping[str, Ints]
+
+
+def _pieces(uh: Function | FunctionSpace, warp: float) -> _Pieces:
+    """Return the pieces of all ranks; collective."""
+    V = _space(uh)
+    if isinstance(uh, Function):
+        _check_finite(uh)
+        values = uh.local_coefficients()
+    else:
+        values = np.zeros((V.cells.num_pieces, element.NUM_FUNCTIONS, 1))
+    everywhere = partial(of_all_ranks, V.cells)
+    numbers = {name: everywhere(array) for name, array in cell_numbers(V.cells).items()}
+    points = _warped(uh, V.cells.piece_points, values, warp)
+    return _Pieces(everywhere(points), everywhere(values), everywhere(V.cells.on_cell_edges), numbers)
+
+
+def _space(uh: Function | FunctionSpace) -> FunctionSpace:
+    if not isinstance(uh, Function | FunctionSpace):
         raise TypeError(f"expected a Function or a FunctionSpace, got {type(uh).__name__}")
-    strange = np.count_nonzero(~np.isfinite(uh.x.array))
+    return uh.function_space if isinstance(uh, Function) else uh
+
+
+def _check_finite(uh: Function) -> None:
+    """Raise ValueError if there are coefficients that are none; collective."""
+    V = uh.function_space
+    strange = total(V.mesh.comm, np.count_nonzero(~np.isfinite(uh.x.array[: V.num_owned_dofs])))
     if strange:
         raise ValueError(
-            f"{strange} of the {uh.x.array.size} coefficients of {uh.name!r} are infinite or not a number: see how "
-            f"they were computed (did the solver diverge?)"
+            f"{strange} of the {V.num_dofs} coefficients of {uh.name!r} are infinite or not a number: see how they "
+            f"were computed (did the solver diverge?)"
         )
-    return uh.function_space.cells, uh.local_coefficients()
 
 
-def _cells_points_and_values(uh: Function | FunctionSpace, warp: float) -> tuple[Cells, Floats, Floats]:
-    """Return cells, local B-spline coefficients of the points to draw, shape (num_pieces, 16, 2 or 3), and values."""
-    cells, values = _cells_and_values(uh)
-    points = cells.piece_points
+def _warped(uh: Function | FunctionSpace, points: Floats, values: Floats, warp: float) -> Floats:
+    """Return local B-spline coefficients of the points to draw, from those of the surface and of the values."""
     if warp == 0.0:
-        return cells, points, values
+        return points
     if not np.isfinite(warp):
         raise ValueError(f"warp is {warp}; expected a finite factor")
     size, gdim = values.shape[2], points.shape[2]
@@ -217,7 +256,7 @@ def _cells_points_and_values(uh: Function | FunctionSpace, warp: float) -> tuple
             f"{what} can not warp a surface in {gdim} dimensions: warp draws the graph of a function on a planar "
             f"domain, or moves points by a function with as many components as they have; leave warp out"
         )
-    return cells, points + warp * values if size == gdim else np.concatenate([points, warp * values], axis=2), values
+    return points + warp * values if size == gdim else np.concatenate([points, warp * values], axis=2)
 
 
 def _by_segments(points: Floats, values: Floats) -> Iterator[tuple[int, Ints]]:
@@ -303,13 +342,14 @@ class _Shown:
 
 
 def _shown(uh: Function | FunctionSpace, cell_data: Mapping[str, npt.ArrayLike] | None) -> _Shown | None:
-    """Return what is to be shown on the elements; None for nothing."""
-    cells, _ = _cells_and_values(uh)
+    """Return what is to be shown on the elements, None for nothing; collective."""
+    V = _space(uh)
     if cell_data is not None:
         if len(cell_data) != 1:
             raise ValueError(f"cell data have the names {list(cell_data)}: a picture can show one; give that")
         ((name, given),) = cell_data.items()
-        values = one_for_each_cell(cells, name, given).astype(np.float64)
+        owned = together(V.mesh.comm, lambda: one_for_each_cell(V.cells, name, given).astype(np.float64))
+        values = V.cells.partition.cells.gather(owned)
         if not np.isfinite(values).all():
             first = int(np.flatnonzero(~np.isfinite(values))[0])
             raise ValueError(f"cell data {name!r} of cell {first} are {values[first]}: give finite values")

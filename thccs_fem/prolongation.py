@@ -34,9 +34,7 @@ class Prolongation:
 
     def __init__(self, fine: Hierarchy, coarse: Hierarchy):
         self._fine, self._coarse = partition(fine).functions, partition(coarse).functions
-        rows = fine.prolongation(coarse)
-        if not self._fine.is_whole:
-            rows = rows[self._fine.numbers]
+        rows = fine.prolongation(coarse, None if self._fine.is_whole else self._fine.numbers)
         self.wanted = np.unique(rows.indices).astype(np.int32)
         if self.wanted.size < rows.shape[1]:
             columns = np.searchsorted(self.wanted, rows.indices).astype(np.int32)
@@ -65,6 +63,17 @@ class Prolongation:
             Shape (coarse local, k), the owned part complete.
         """
         owned = self._fine.size_local
-        result = np.zeros((self._coarse.numbers.size, *load.shape[1:]))
-        self._fetch.add_back(self.matrix[:owned].T @ load[:owned], result)
+        return self.gathered(self.matrix[:owned].T @ load[:owned])
+
+    def gathered(self, contributions: Floats) -> Floats:
+        """Return the sums over ranks of what each has for the coarse dofs that it wants.
+
+        Args:
+            contributions: Shape (wanted,) or (wanted, k).
+
+        Returns:
+            Shape (coarse local,) or (coarse local, k), the owned part complete.
+        """
+        result = np.zeros((self._coarse.numbers.size, *contributions.shape[1:]))
+        self._fetch.add_back(contributions, result)
         return result

@@ -25,17 +25,21 @@ import scipy.sparse as sp
 
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.polygons import following_corners, previous_corners
+from thccs_fem.sparse import Triplets, entries, product, stacked, summed
 
 __all__ = [
     "Bools",
+    "Children",
     "Ints",
     "Level",
     "Step",
+    "children",
     "control_level",
     "neighbourhood",
     "rim_distance",
     "subdivide",
     "subdivided",
+    "with_matrix",
 ]
 
 INFINITE_SHARPNESS = 10.0  # at and above this a crease or corner never becomes smooth
@@ -281,12 +285,11 @@ def _on_halves[T](values: Mapping[tuple[int, int], T], level: Level, step: Step)
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """One subdivision step from a level to the next.
+class Children:
+    """The topology of one subdivision step from a level to the next.
 
     Attributes:
         fine: The children.
-        matrix: S, shape (fine.num_vertices, coarse vertices); rows sum to one.
         first_child: First child of each coarse face (the child at half-edge offsets[f] + k is the first + k), -1 for
             faces that were not subdivided, shape (coarse faces,).
         old: Coarse vertex of each old vertex of the fine level, shape (num_old,).
@@ -294,10 +297,20 @@ class Step:
     """
 
     fine: Level
-    matrix: sp.csr_array
     first_child: Ints
     old: Ints
     edges: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Step(Children):
+    """One subdivision step from a level to the next.
+
+    Attributes:
+        matrix: S, shape (fine.num_vertices, coarse vertices); rows sum to one.
+    """
+
+    matrix: sp.csr_array
 
 
 def subdivide(level: Level, faces: Bools) -> Step:
@@ -307,16 +320,32 @@ def subdivide(level: Level, faces: Bools) -> Step:
         level: The level that holds the faces.
         faces: Marked faces, shape (level.num_faces,).
     """
+    return with_matrix(level, faces, children(level, faces))
+
+
+def with_matrix(level: Level, faces: Bools, made: Children) -> Step:
+    """Return the step that makes the children of the marked faces."""
+    matrix = _step_matrix(level, faces, made.old, made.edges)
+    return Step(made.fine, made.first_child, made.old, made.edges, matrix)
+
+
+def children(level: Level, faces: Bools, fine: Level | None = None) -> Children:
+    """Return what `subdivide` does, but for S.
+
+    Args:
+        level: The level that holds the faces.
+        faces: Marked faces, shape (level.num_faces,).
+        fine: The level of the children where it is known.
+    """
     chosen = np.flatnonzero(faces).astype(np.int32)
     half_edges = level.half_edges(chosen)
     child = np.full(level.vertices.size, -1, dtype=np.int32)
     child[half_edges] = np.arange(half_edges.size, dtype=np.int32)
     old = np.flatnonzero(level.corners_of(faces)).astype(np.int32)
     edge, edges = _number_edges(level, half_edges)
-    fine = _child_level(level, chosen, half_edges, child, old, edge, edges)
-    first_child = np.where(faces, child[level.offsets[:-1]], -1).astype(np.int32)
-    matrix = _step_matrix(level, chosen, half_edges, child, old, edges)
-    return Step(fine, matrix, first_child, old, edges)
+    if fine is None:
+        fine = _child_level(level, chosen, half_edges, child, old, edge, edges)
+    return Children(fine, np.where(faces, child[level.offsets[:-1]], -1).astype(np.int32), old, edges)
 
 
 def _number_edges(level: Level, half_edges: Ints) -> tuple[Ints, Ints]:
@@ -406,50 +435,36 @@ def _child_twins(level: Level, half_edges: Ints, child: Ints) -> Ints:
     return twins.ravel().astype(np.int32)
 
 
-def _step_matrix(level: Level, chosen: Ints, half_edges: Ints, child: Ints, old: Ints, edges: Ints) -> sp.csr_array:
-    """Return S, shape (old + edges + chosen, coarse vertices); see `subdivide`."""
-    num_vertices = level.num_vertices
+def _step_matrix(level: Level, faces: Bools, old: Ints, edges: Ints) -> sp.csr_array:
+    """Return S, shape (old + edges + marked faces, coarse vertices); see `Children`."""
+    chosen = np.flatnonzero(faces).astype(np.int32)
+    half_edges = level.half_edges(chosen)
     sizes = np.diff(level.offsets)[chosen]
-    start = level.vertices[half_edges]
-    face_point = sp.csr_array(
-        (np.repeat(1.0 / sizes, sizes), start, np.concatenate([[0], np.cumsum(sizes)])),
-        shape=(chosen.size, num_vertices),
+    face_of_corner = np.repeat(np.arange(chosen.size, dtype=np.int32), sizes)
+    face_point = summed(
+        [(face_of_corner, level.vertices[half_edges], np.repeat(1.0 / sizes, sizes))], (chosen.size, level.num_vertices)
     )
     face_number = np.full(level.num_faces, -1, dtype=np.int32)
     face_number[chosen] = np.arange(chosen.size, dtype=np.int32)
-    edge_rows = _edge_rows(level, edges, child, face_number, face_point)
     vertex_rows = _vertex_rows(level, half_edges, old, face_number, face_point)
-    return sp.csr_array(sp.vstack([vertex_rows, edge_rows, face_point], format="csr"))
+    edge_rows = _edge_rows(level, edges, face_number, face_point)
+    return stacked([vertex_rows, edge_rows, face_point])
 
 
-def _edge_rows(level: Level, edges: Ints, child: Ints, face_number: Ints, face_point: sp.csr_array) -> sp.csr_array:
+def _edge_rows(level: Level, edges: Ints, face_number: Ints, face_point: sp.csr_array) -> sp.csr_array:
     """Edge points: mean of the ends and the two face points; midpoint on the rim."""
     twins = level.twins[edges]
-    inner = np.flatnonzero((twins >= 0) & (child[twins] >= 0))
-    rows = np.arange(edges.size)
+    inner = np.flatnonzero((twins >= 0) & (face_number[level.face[twins]] >= 0)).astype(np.int32)
+    rows = np.arange(edges.size, dtype=np.int32)
     weight = np.full(edges.size, 0.5)
     weight[inner] = 0.25
-    ends = sp.csr_array(
-        (
-            np.concatenate([weight, weight]),
-            (
-                np.concatenate([rows, rows]),
-                np.concatenate([level.vertices[edges], level.vertices[level.following[edges]]]),
-            ),
-        ),
-        shape=(edges.size, level.num_vertices),
+    sides = summed(
+        [(inner, face_number[level.face[side[inner]]], 0.25) for side in (edges, twins)],
+        (edges.size, face_point.shape[0]),
     )
-    sides = sp.csr_array(
-        (
-            np.full(2 * inner.size, 0.25),
-            (
-                np.concatenate([inner, inner]),
-                face_number[level.face[np.concatenate([edges[inner], twins[inner]])]],
-            ),
-        ),
-        shape=(edges.size, face_point.shape[0]),
-    )
-    return ends + sides @ face_point
+    start, end = level.vertices[edges], level.vertices[level.following[edges]]
+    ends: Triplets = [(rows, start, weight), (rows, end, weight)]
+    return summed([*ends, entries(product(sides, face_point))], (edges.size, level.num_vertices))
 
 
 def _vertex_rows(
@@ -459,35 +474,28 @@ def _vertex_rows(
 
     Corners stay; so do vertices whose surroundings are not all in this part (placeholders).
     """
-    num_vertices = level.num_vertices
     start = level.vertices[half_edges]
-    count = np.bincount(start, minlength=num_vertices)
+    count = np.bincount(start, minlength=level.num_vertices)
     n = level.vertex_num_faces.astype(np.float64)
     inner = ~level.boundary & (count == level.vertex_num_faces)
+    row_of = np.full(level.num_vertices, -1, dtype=np.int32)
+    row_of[old] = np.arange(old.size, dtype=np.int32)
     corners = half_edges[inner[start]]
     v = level.vertices[corners]
-    per_face = 1.0 / n[v] ** 2
-    around = sp.csr_array((per_face, (v, face_number[level.face[corners]])), shape=(num_vertices, face_point.shape[0]))
-    # Each edge at v is met from both its faces: half of each midpoint from either side.
+    row, per_face = row_of[v], 1.0 / n[v] ** 2
+    around = summed([(row, face_number[level.face[corners]], per_face)], (old.size, face_point.shape[0]))
     rim = half_edges[level.rim[half_edges]]
     a, b = level.vertices[rim], level.vertices[level.following[rim]]
-    ends = np.bincount(np.concatenate([a, b]), minlength=num_vertices)
+    ends = np.bincount(np.concatenate([a, b]), minlength=level.num_vertices)
     smooth = level.boundary & ~level.corner & (ends == 2)
-    a_smooth, b_smooth = smooth[a], smooth[b]
-    everyone = np.arange(num_vertices)
-    rows = np.concatenate([everyone, v, v, v, a[a_smooth], b[b_smooth]])
-    columns = np.concatenate(
-        [
-            everyone,
-            v,
-            level.vertices[level.following[corners]],
-            level.vertices[level.previous[corners]],
-            b[a_smooth],
-            a[b_smooth],
-        ]
-    )
     own = np.where(inner, (n - 3.0) / n, np.where(smooth, 0.75, 1.0))
-    eighth = np.full(np.count_nonzero(a_smooth) + np.count_nonzero(b_smooth), 0.125)
-    values = np.concatenate([own, per_face, 0.5 * per_face, 0.5 * per_face, eighth])
-    local = sp.csr_array((values, (rows, columns)), shape=(num_vertices, num_vertices))
-    return (local + around @ face_point)[old]
+    local: Triplets = [
+        (row_of[old], old, own[old]),
+        (row, v, per_face),
+        # Each edge at v is met from both its faces: half of each midpoint from either side.
+        (row, level.vertices[level.following[corners]], 0.5 * per_face),
+        (row, level.vertices[level.previous[corners]], 0.5 * per_face),
+        (row_of[a[smooth[a]]], b[smooth[a]], 0.125),
+        (row_of[b[smooth[b]]], a[smooth[b]], 0.125),
+    ]
+    return summed([*local, entries(product(around, face_point))], (old.size, level.num_vertices))

@@ -1,74 +1,320 @@
-"""Seconds of CPU and peak memory from a control mesh to the file with the solution, for growing numbers of dofs.
+"""Time and memory from a control mesh to the file with the solution, for growing numbers of dofs and on several ranks.
 
--div(grad(u)) + u = x0 x1 on the sphere of six n x n faces, with eight extraordinary vertices of valence 3. Conjugate
-gradients with multigrid to 1e-10.
+-div(grad(u)) + u = x0 x1 on the sphere of six n x n faces, with eight extraordinary vertices of valence 3. Beside it
+DOLFINx with cubic Lagrange elements on quadrilaterals of degree 3, each in the place of 3 x 3 of our faces, whose
+vertices are its nodes: so both have the same number of dofs, and DOLFINx a ninth of the cells. Both integrate with
+4 x 4 Gauss points and solve by conjugate gradients to 1e-10: ours with multigrid on the levels of subdivision, DOLFINx
+with the algebraic one of PETSc (GAMG).
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/scale.py [n ...]
+    OMP_NUM_THREADS=1 python tests/benchmarks/scale.py [n ...] [--ranks 1 2] [--repeats 1]
 
-One run of each size, the smallest first, in one process: peak memory is that of all until then. Kernels are
-compiled before; "solve" has an assembly of its own in it. On two slow cores:
+n is a multiple of 3, for multigrid also of a power of 2. Each run is a process of its own, or one for each rank, so
+that its peak of memory is its own; kernels are compiled before. Columns are seconds, of CPU on one rank, else those
+that pass ("wall"); those of assembly and solution are the least of the repeats:
 
-| dofs | mesh | space | assembly | solve | file | together | iterations | peak GB |
-|---|---|---|---|---|---|---|---|---|
-| 9602 | 0.03 | 0.03 | 0.03 | 0.11 | 0.09 | 0.28 | 6 | 0.28 |
-| 98306 | 0.27 | 0.15 | 0.48 | 1.26 | 1.17 | 3.31 | 5 | 0.75 |
-| 1038338 | 3.65 | 1.29 | 5.25 | 14.64 | 14.02 | 38.85 | 5 | 5.60 |
+- set-up: control mesh, hierarchy, cells; DOLFINx's mesh, with the nodes given, and space
+- assembly: a new matrix with its pattern, and the load; again: new values in the same matrix
+- solve: preconditioner and iterations
+- file: one .vtu; DOLFINx's .pvd
+- together: all but "again"; peak GB: of the largest rank, with Python and all libraries
+
+The last row of a case has the exponents by which figures grow between the two largest sizes: 1 is linear.
+
+The second table has MB of arrays on the largest rank, and the third how much of two ranks' time is used.
 """
 
+import argparse
+import dataclasses
+import json
+import math
+import os
 import resource
+import shutil
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+import dolfinx.fem.petsc
+import dolfinx.io
+import numpy as np
+import numpy.typing as npt
+
+import basix.ufl
 import ufl
-from thccs_fem import fem, generators, io
-from thccs_fem.fem.petsc import LinearProblem
+from thccs_fem import fem, generators, io, jit
+from thccs_fem.fem import petsc as fem_petsc
+from thccs_fem.partition import partition
 
-SIZES = (40, 128, 416)
-STAGES = ("mesh", "space", "assembly", "solve", "file")
+SIZES = (48, 144, 432)
+SMALL = 6  # of a first run, which compiles
+GAUSS = {"quadrature_degree": 7}
+STAGES = ("set-up", "assembly", "again", "solve", "file")
+
+type Results = dict[tuple[str, int], list[dict[str, Any]]]  # of each case and number of ranks, for each size
 
 
-def measured(n: int) -> tuple[int, dict[str, float], int]:
-    """Return the number of dofs, CPU seconds of each stage and iterations."""
-    seconds: dict[str, float] = {}
+class Clock:
+    """Seconds of CPU and of time that passes, for each stage."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        self.comm = comm
+        self.cpu: dict[str, float] = {}
+        self.wall: dict[str, float] = {}
 
     @contextmanager
-    def stage(name: str) -> Iterator[None]:
-        start = time.process_time()
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure a stage; of several times the least counts."""
+        self.comm.Barrier()
+        cpu, wall = time.process_time(), time.perf_counter()
         yield
-        seconds[name] = time.process_time() - start
+        spent = time.process_time() - cpu  # not in waiting for others
+        self.comm.Barrier()
+        for seconds, now in ((self.cpu, spent), (self.wall, time.perf_counter() - wall)):
+            seconds[name] = min(self.comm.allreduce(now, op=MPI.MAX), seconds.get(name, math.inf))
 
-    with stage("mesh"):
+
+def stiffness_and_mass(u: ufl.Argument, v: ufl.Argument) -> ufl.Form:
+    return (ufl.inner(ufl.grad(u), ufl.grad(v)) + u * v) * ufl.dx(metadata=GAUSS)
+
+
+def load(x: ufl.SpatialCoordinate, v: ufl.Argument) -> ufl.Form:
+    return x[0] * x[1] * v * ufl.dx(metadata=GAUSS)
+
+
+class Ours:
+    """THCCS functions."""
+
+    def __init__(self, n: int, comm: MPI.Comm, clock: Clock) -> None:
+        with clock.stage("set-up"):
+            msh = generators.cube_sphere(n, comm=comm)
+            self.V = fem.functionspace(msh, ("THCCS", 3))
+        u, v, x = ufl.TrialFunction(self.V), ufl.TestFunction(self.V), ufl.SpatialCoordinate(msh)
+        self.a, self.L = fem.form(stiffness_and_mass(u, v)), fem.form(load(x, v))
+        self.num_dofs = self.V.num_dofs
+
+    def matrix(self) -> PETSc.Mat:
+        """Make a matrix with a new pattern, which is kept with the cells."""
+        self.a = dataclasses.replace(self.a, cells=dataclasses.replace(self.a.cells))
+        return fem_petsc.assemble_matrix(self.a)
+
+    def refill(self, A: PETSc.Mat) -> None:
+        fem_petsc.assemble_matrix(A, self.a)
+
+    def vector(self) -> PETSc.Vec:
+        return fem_petsc.assemble_vector(self.L)
+
+    def precondition(self, ksp: PETSc.KSP) -> None:
+        fem_petsc.multigrid(ksp, self.V)
+
+    def write(self, folder: Path, x: PETSc.Vec) -> None:
+        uh = fem.Function(self.V, name="u")
+        uh.x.array[: x.getLocalSize()] = x.array_r
+        uh.x.scatter_forward()
+        io.write_vtu(folder / "u.vtu", uh)
+
+
+class CubicLagrange:
+    """DOLFINx's Q3 on the sphere."""
+
+    def __init__(self, n: int, comm: MPI.Comm, clock: Clock, flags: Sequence[str]) -> None:
+        cells, points, element = self.sphere(n) if comm.rank == 0 else self.sphere(0)
+        with clock.stage("set-up"):
+            self.mesh = dolfinx.mesh.create_mesh(comm, cells, element, points)
+            self.V = dolfinx.fem.functionspace(self.mesh, ("Lagrange", 3))
+        options = {"cache_dir": jit.cache_directory() / "dolfinx"}
+        if flags:
+            options["cffi_extra_compile_args"] = list(flags)
+        u, v, x = ufl.TrialFunction(self.V), ufl.TestFunction(self.V), ufl.SpatialCoordinate(self.mesh)
+        self.a = dolfinx.fem.form(stiffness_and_mass(u, v), jit_options=options)
+        self.L = dolfinx.fem.form(load(x, v), jit_options=options)
+        self.num_dofs = self.V.dofmap.index_map.size_global
+
+    @staticmethod
+    def sphere(n: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], basix.ufl._BlockedElement]:
+        """Return cells of 4 x 4 nodes, nodes, and the element; n = 0: no cells."""
+        element = basix.ufl.element(
+            "Lagrange", "quadrilateral", 3, lagrange_variant=basix.LagrangeVariant.equispaced, shape=(3,)
+        )
+        if n == 0:
+            return np.zeros((0, 16), dtype=np.int64), np.zeros((0, 3)), element
         msh = generators.cube_sphere(n)
-    with stage("space"):
-        V = fem.functionspace(msh, ("THCCS", 3))
-    u, v, x = ufl.TrialFunction(V), ufl.TestFunction(V), ufl.SpatialCoordinate(msh)
-    a = fem.form((ufl.inner(ufl.grad(u), ufl.grad(v)) + u * v) * ufl.dx)
-    L = fem.form(x[0] * x[1] * v * ufl.dx)
-    with stage("assembly"):
-        fem.assemble_matrix(a)
-        fem.assemble_vector(L)
-    options = {"ksp_type": "cg", "pc_type": "mg"}
-    problem = LinearProblem(a, L, petsc_options_prefix="scale_", petsc_options=options)
-    with stage("solve"):
-        uh = problem.solve()
-    with stage("file"), tempfile.TemporaryDirectory() as folder:
-        io.write_vtu(Path(folder, "u.vtu"), uh)
-    return V.num_dofs, seconds, problem.solver.getIterationNumber()
+        faces = msh.quads.reshape(6, n, n, 4)
+        nodes = np.zeros((6, n + 1, n + 1), dtype=np.int64)
+        for corner, (i, j) in enumerate([(0, 0), (0, 1), (1, 1), (1, 0)]):
+            nodes[:, i : n + i, j : n + j] = faces[..., corner]
+        local = np.rint(3 * element.basix_element.points).astype(int)
+        first = 3 * np.arange(n // 3)
+        cells = nodes[:, (first[:, None] + local[:, 1])[:, None, :], first[:, None] + local[:, 0]]
+        return cells.reshape(-1, 16), msh.vertices, element
+
+    def matrix(self) -> PETSc.Mat:
+        A = dolfinx.fem.petsc.assemble_matrix(self.a)
+        A.assemble()
+        return A
+
+    def refill(self, A: PETSc.Mat) -> None:
+        A.zeroEntries()
+        dolfinx.fem.petsc.assemble_matrix(A, self.a)
+        A.assemble()
+
+    def vector(self) -> PETSc.Vec:
+        b = dolfinx.fem.petsc.assemble_vector(self.L)
+        b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        return b
+
+    def precondition(self, ksp: PETSc.KSP) -> None:
+        ksp.getPC().setType("gamg")
+
+    def write(self, folder: Path, x: PETSc.Vec) -> None:
+        uh = dolfinx.fem.Function(self.V, name="u")
+        uh.x.array[: x.getLocalSize()] = x.array_r
+        uh.x.scatter_forward()
+        with dolfinx.io.VTKFile(self.mesh.comm, folder / "u.pvd", "w") as file:
+            file.write_function(uh)
+
+
+def megabytes(thing: object, seen: set[int]) -> float:
+    """Return how much memory the arrays in an object take, apart from those seen before."""
+    while isinstance(thing, np.ndarray) and isinstance(thing.base, np.ndarray):
+        thing = thing.base
+    if id(thing) in seen:
+        return 0.0
+    seen.add(id(thing))
+    if isinstance(thing, np.ndarray):
+        return thing.nbytes / 1e6
+    inside = vars(thing) if hasattr(thing, "__dict__") and not isinstance(thing, type) else thing
+    values = inside.values() if isinstance(inside, Mapping) else inside if isinstance(inside, list | tuple) else ()
+    return sum(megabytes(value, seen) for value in values)
+
+
+def memory(V: fem.FunctionSpace, A: PETSc.Mat) -> dict[str, float]:
+    """Return MB of the components of a space and its matrix, on the largest rank."""
+    comm, parts = V.mesh.comm, partition(V.hierarchy)
+    seen = {id(comm), id(V.cells), id(parts)}
+    sizes = {"control mesh": megabytes(V.mesh, seen), "hierarchy": megabytes(V.hierarchy, seen)}
+    seen -= {id(V.cells), id(parts)}
+    sizes |= {"partition": megabytes(parts, seen), "cells": megabytes(V.cells, seen)}
+    values = np.dtype(PETSc.ScalarType).itemsize + np.dtype(PETSc.IntType).itemsize
+    sizes["matrix"] = A.getInfo(PETSc.Mat.InfoType.LOCAL)["nz_used"] * values / 1e6
+    return {name: comm.allreduce(size, op=MPI.MAX) for name, size in sizes.items()}
+
+
+def run(case: str, n: int, repeats: int) -> dict[str, Any]:
+    """Return what a run came to, on rank 0."""
+    comm = MPI.COMM_WORLD
+    CASES[case](SMALL, comm, Clock(comm)).matrix()  # compiles
+    clock = Clock(comm)
+    problem = CASES[case](n, comm, clock)
+    for _ in range(repeats):
+        with clock.stage("assembly"):
+            A, b = problem.matrix(), problem.vector()
+        with clock.stage("again"):
+            problem.refill(A)
+    for _ in range(repeats):
+        ksp = PETSc.KSP().create(comm)
+        ksp.setOperators(A)
+        ksp.setTolerances(rtol=1e-10)
+        ksp.setType("cg")
+        problem.precondition(ksp)
+        x = A.createVecRight()
+        with clock.stage("solve"):
+            ksp.solve(b, x)
+        assert ksp.is_converged
+    with tempfile.TemporaryDirectory() as name:
+        folder = comm.bcast(name)
+        with clock.stage("file"):
+            problem.write(Path(folder), x)
+    peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6, op=MPI.MAX)
+    found = {"dofs": problem.num_dofs, "iterations": ksp.getIterationNumber(), "peak": peak}
+    found |= {"memory": memory(problem.V, A)} if isinstance(problem, Ours) else {}
+    return found | {"seconds": clock.cpu if comm.size == 1 else clock.wall, "wall": clock.wall}
+
+
+CASES: dict[str, Callable[[int, MPI.Comm, Clock], Ours | CubicLagrange]] = {
+    "THCCS": Ours,
+    "Q3, default flags": partial(CubicLagrange, flags=()),
+    "Q3, our flags": partial(CubicLagrange, flags=jit.FLAGS),
+}
+
+
+def measured(case: str, n: int, ranks: int, repeats: int) -> dict[str, Any]:
+    """Run in processes of their own, and return what came out."""
+    beside = Path(sys.executable).with_name("mpirun")
+    launcher = [str(beside) if beside.exists() else shutil.which("mpirun") or "mpirun", "-n", str(ranks)]
+    command = [sys.executable, __file__, str(n), "--here", "--cases", case, "--repeats", str(repeats)]
+    done = subprocess.run(command if ranks == 1 else launcher + command, check=True, stdout=subprocess.PIPE, text=True)
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
+def times(results: Results) -> Iterator[str]:
+    """Yield the rows of the first table."""
+    yield f"| dofs | case | {' | '.join(STAGES)} | together | iterations | peak GB |"
+    yield "|---" * (len(STAGES) + 5) + "|"
+    for (case, ranks), runs in results.items():
+        for found in runs:
+            seconds = [found["seconds"][stage] for stage in STAGES]
+            figures = " | ".join(f"{s:.2f}" for s in (*seconds, sum(seconds) - found["seconds"]["again"]))
+            name = case if ranks == 1 else f"{case}, {ranks} ranks (wall)"
+            yield f"| {found['dofs']} | {name} | {figures} | {found['iterations']} | {found['peak']:.2f} |"
+        if len(runs) > 1:
+            before, after = runs[-2:]
+            factors = [after["seconds"][stage] / before["seconds"][stage] for stage in STAGES]
+            exponents = np.log(factors) / math.log(after["dofs"] / before["dofs"])
+            yield f"| | growth | {' | '.join(f'{e:.2f}' for e in exponents)} | | | |"
+
+
+def memories(results: Results) -> Iterator[str]:
+    """Yield the rows of the second table."""
+    runs = {ranks: runs[-1] for (case, ranks), runs in results.items() if case == "THCCS"}
+    yield f"| MB, dofs | {' | '.join(f'{found["dofs"]}, {ranks} rank(s)' for ranks, found in runs.items())} |"
+    yield "|---" * (len(runs) + 1) + "|"
+    for name in next(iter(runs.values()))["memory"] if runs else ():
+        yield f"| {name} | {' | '.join(f'{found["memory"][name]:.0f}' for found in runs.values())} |"
+
+
+def efficiencies(results: Results) -> Iterator[str]:
+    """Yield the rows of the third table."""
+    yield f"| efficiency | {' | '.join(STAGES)} |"
+    yield "|---" * (len(STAGES) + 1) + "|"
+    for (case, ranks), runs in results.items():
+        if ranks > 1 and (case, 1) in results:
+            one, more = results[case, 1][-1]["wall"], runs[-1]["wall"]
+            shares = " | ".join(f"{one[stage] / (ranks * more[stage]):.0%}" for stage in STAGES)
+            yield f"| {case}, {ranks} ranks, {runs[-1]['dofs']} dofs | {shares} |"
 
 
 def main() -> None:
-    print(f"| dofs | {' | '.join(STAGES)} | together | iterations | peak GB |")
-    print("|---" * (len(STAGES) + 4) + "|")
-    measured(8)  # compiles
-    for n in [int(given) for given in sys.argv[1:]] or SIZES:
-        dofs, seconds, iterations = measured(n)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        figures = [f"{seconds[name]:.2f}" for name in STAGES] + [f"{sum(seconds.values()):.2f}"]
-        print(f"| {dofs} | {' | '.join(figures)} | {iterations} | {peak:.2f} |")
+    parser = argparse.ArgumentParser()
+    parser.add_argument("sizes", nargs="*", type=int, default=SIZES)
+    parser.add_argument("--ranks", nargs="+", type=int, default=[1])
+    parser.add_argument("--repeats", type=int, default=1)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES)
+    parser.add_argument("--here", action="store_true", help="run the first size and case here, and print what came out")
+    given = parser.parse_args()
+    if given.here:
+        found = run(given.cases[0], given.sizes[0], given.repeats)
+        if MPI.COMM_WORLD.rank == 0:
+            print(json.dumps(found))
+        return
+    results = {
+        (case, ranks): [measured(case, n, ranks, given.repeats) for n in given.sizes]
+        for case in given.cases
+        for ranks in given.ranks
+    }
+    for table in (times, memories, efficiencies):
+        print("\n".join(table(results)), end="\n\n")
 
 
 if __name__ == "__main__":

@@ -96,3 +96,36 @@ sys.exit(7)
     )
     code, output = run_on_ranks(2, str(file), time_limit=SECONDS, cwd=tmp_path)
     assert (code, output) == (7, "")
+
+
+PROBLEM = """
+import ufl
+from thccs_fem import fem
+from thccs_fem.fem.petsc import LinearProblem
+
+V = fem.functionspace(generators.torus((5, 4), comm=comm), ("THCCS", 3))
+u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+f = fem.Function(V)
+f.x.array[:] = 1.0
+a, L = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx + u * v * ufl.dx, f * v * ufl.dx
+options = {"ksp_type": "cg", "pc_type": "none", "ksp_max_it": 1, "ksp_rtol": 1e-14}
+"""
+
+
+@pytest.mark.parametrize(
+    ("size", "line", "error"),
+    [
+        (3, "LinearProblem(a, L, petsc_options_prefix='a_', petsc_options=options).solve()", "DIVERGED_MAX_IT"),
+        (
+            2,
+            "f.x.array[0] = [1, 'nan'][comm.rank]; LinearProblem(a, L, petsc_options_prefix='a_').solve()",
+            "not finite",
+        ),
+    ],
+    ids=["iterations", "nan"],
+)
+def test_solver_that_fails(tmp_path: Path, size: int, line: str, error: str) -> None:
+    output = ending(tmp_path, size, PROBLEM + line)
+    assert output.startswith("Traceback")
+    assert "\nRuntimeError: PETSc's" in output
+    assert error in output

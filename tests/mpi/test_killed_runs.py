@@ -62,7 +62,7 @@ if MPI.COMM_WORLD.rank == 0:
 )
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_run_goes_on_on_other_ranks(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     (tmp_path / "killed.py").write_text(KILLED)

@@ -24,11 +24,21 @@ from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.fem.sparsity import Pattern, pattern, pointer
 from thccs_fem.index_map import IndexMap
 from thccs_fem.jit import library
+from thccs_fem.parallel import together
+from thccs_fem.subdivision import Ints
 
-__all__ = ["assemble_cells", "assemble_matrix", "assemble_scalar", "assemble_vector", "bubble_energies", "integrals"]
+__all__ = [
+    "assemble_block",
+    "assemble_cells",
+    "assemble_matrix",
+    "assemble_scalar",
+    "assemble_vector",
+    "bubble_energies",
+    "integrals",
+    "refill_block",
+]
 
 Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int32]
 
 
 def assemble_scalar(form: Form, /) -> float:
@@ -96,9 +106,49 @@ def assemble_matrix(form: Form | sp.csr_array, refilling: Form | None = None, /)
             the same spaces; or there are more entries than int32 can count.
     """
     if refilling is None:
-        return _new_matrix(form)
-    _refill(form, refilling)
+        _check_rank(form, 2)
+        return assemble_block(form, form.spaces[1].index_map)
+    _check_rank(refilling, 2)
+    refill_block(form, refilling, refilling.spaces[1].index_map)
     return form
+
+
+def assemble_block(form: Form, columns: IndexMap) -> sp.csr_array:
+    """Return the matrix of a form in terms of more trial functions than this rank holds in their space.
+
+    It needs more where trial and test functions are on different hierarchies, each spread in its own way.
+
+    Args:
+        form: Compiled form with two arguments.
+        columns: The trial functions; see `Layout.index_maps`.
+
+    Raises:
+        NotImplementedError: Some trial functions that are needed are not there.
+    """
+    _check_rank(form, 2)
+    indptr, indices = _structure(form)
+    values = np.zeros(indices.size)
+    _add_matrix(form, values)
+    trial = form.spaces[1]
+    A = sp.csr_array((values, indices, indptr), shape=(indptr.size - 1, form.cells.num_dofs * trial.block_size))
+    if _is_coarser(form):
+        return _on_coarser(A, form, columns)
+    if columns is not trial.index_map:
+        held = _dofs(trial, columns.local_of(trial.index_map.numbers))  # as ascending as they were
+        A = sp.csr_array((values, held[indices], indptr), shape=(A.shape[0], trial.block_size * columns.numbers.size))
+    return A
+
+
+def refill_block(A: sp.csr_array, form: Form, columns: IndexMap) -> None:
+    """Give a matrix that `assemble_block` has made new values."""
+    if _is_coarser(form) or columns is not form.spaces[1].index_map:
+        new = assemble_block(form, columns)
+        _check_structure(A, new.indptr, new.indices)
+        A.data[:] = new.data
+    else:
+        _check_structure(A, *_structure(form))
+        A.data[:] = 0.0
+        _add_matrix(form, A.data)
 
 
 def integrals(V: FunctionSpace) -> Floats:
@@ -148,27 +198,18 @@ def _check_rank(form: Form, rank: int) -> None:
         raise ValueError(f"the form of {what[rank]}, but this one has {form.rank} arguments")
 
 
-def _new_matrix(form: Form) -> sp.csr_array:
-    _check_rank(form, 2)
-    indptr, indices = _structure(form)
-    values = np.zeros(indices.size)
-    _add_matrix(form, values)
-    shape = indptr.size - 1, form.cells.num_dofs * form.spaces[1].block_size
-    A = sp.csr_array((values, indices, indptr), shape=shape)
-    return _on_coarser(A, form) if _is_coarser(form) else A
-
-
 def _is_coarser(form: Form) -> bool:
     """Return whether an argument is on a coarser hierarchy than that which is integrated on."""
     return any(space.hierarchy in form.transfers for space in form.spaces)
 
 
-def _on_coarser(A: sp.csr_array, form: Form) -> sp.csr_array:
+def _on_coarser(A: sp.csr_array, form: Form, known: IndexMap) -> sp.csr_array:
     """Return the matrix of a form in terms of its arguments' dofs; collective, as several ranks contribute to a row.
 
     Args:
         A: The matrix in terms of the dofs of the form's finest hierarchy.
         form: The form.
+        known: Trial functions that may be columns.
     """
     (test, trial), (T, U) = form.spaces, (form.transfers.get(space.hierarchy) for space in form.spaces)
     T_owned = None if T is None else _blocked(T.matrix, test)[: A.shape[0]]
@@ -180,11 +221,20 @@ def _on_coarser(A: sp.csr_array, form: Form) -> sp.csr_array:
         rows = _dofs(test, _global(test.index_map, T.wanted))[rows]
         rows, columns, values = at_owners(test.mesh.comm, starts, rows, columns, values)
         rows = rows - test.block_size * test.index_map.local_range[0]
-    local = trial.index_map.local_of(columns // trial.block_size)
+    local = known.local_of(columns // trial.block_size)
+    together(trial.mesh.comm, lambda: _check_known(local))
     columns = trial.block_size * local + columns % trial.block_size
-    A = sp.csr_array((values, (rows, columns)), shape=(test.num_owned_dofs, trial.num_local_dofs))
+    A = sp.csr_array((values, (rows, columns)), shape=(test.num_owned_dofs, trial.block_size * known.numbers.size))
     A.sort_indices()
     return A
+
+
+def _check_known(local: Ints) -> None:
+    if (local < 0).any():
+        raise NotImplementedError(
+            f"{np.count_nonzero(local < 0)} entries of this rank's rows are in columns that it does not hold, as test "
+            f"and trial functions are on different hierarchies: use fem.petsc.assemble_matrix"
+        )
 
 
 def _carried(A: sp.csr_array, test: sp.csr_array | None, trial: sp.csr_array | None) -> sp.csr_array:
@@ -208,18 +258,6 @@ def _carried(A: sp.csr_array, test: sp.csr_array | None, trial: sp.csr_array | N
     places.data[:] = 0.0
     places.data[np.searchsorted(keys(places), keys(values))] = values.data
     return places
-
-
-def _refill(A: sp.csr_array, form: Form) -> None:
-    _check_rank(form, 2)
-    if _is_coarser(form):
-        new = _new_matrix(form)
-        _check_structure(A, new.indptr, new.indices)
-        A.data[:] = new.data
-    else:
-        _check_structure(A, *_structure(form))
-        A.data[:] = 0.0
-        _add_matrix(form, A.data)
 
 
 def _check_structure(A: sp.csr_array, indptr: Ints, indices: Ints) -> None:

@@ -1,7 +1,8 @@
 """Strong Dirichlet conditions: which degrees of freedom, and which values.
 
-Functions are named by their numbers 0 .. V.num_functions; of a vector-valued space a condition takes all components of
-a function, or one through `V.sub(c)`. Equations of fourth order prescribe the slope as well, the derivative along the
+Functions are named by their numbers 0 .. V.num_functions, on several ranks by local ones, and each rank names those of
+its ghosts as well: what is found here is complete. Of a vector-valued space a condition takes all components of a
+function, or one through `V.sub(c)`. Equations of fourth order prescribe the slope as well, the derivative along the
 conormal of the boundary: `slope=True`. What expressions become is in `fitting`.
 """
 
@@ -19,6 +20,7 @@ from thccs_fem.fem.expression import ValueOrExpression
 from thccs_fem.fem.fitting import fitted, side_rows
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import Component, FunctionSpace, check_space
+from thccs_fem.parallel import together
 from thccs_fem.positions import side_points
 from thccs_fem.subdivision import Bools, Ints
 
@@ -35,7 +37,7 @@ class DirichletBC:
 
     Attributes:
         function_space: The space.
-        dofs: Degrees of freedom, ascending, shape (n,), local.
+        dofs: Degrees of freedom, ascending, shape (n,), local, ghosts included.
         values: Their values, shape (n,).
     """
 
@@ -45,27 +47,27 @@ class DirichletBC:
 
 
 def locate_dofs_geometrical(V: FunctionSpace, marker: Marker) -> Ints:
-    """Return the functions whose reference point is marked.
+    """Return the functions whose reference point is marked; collective.
 
     Args:
         V: The space.
         marker: Takes points x of shape (3, n) (the last row is zero in the plane), returns booleans of shape (n,).
 
     Returns:
-        Function numbers, ascending, shape (m,), local.
+        Function numbers, ascending, shape (m,), local, ghosts included.
 
     Raises:
         TypeError: If V is no space of splines.
         ValueError: If the marker returns another shape.
     """
     check_space(V, "locate_dofs_geometrical")
-    return np.flatnonzero(_marked(marker, V.reference_points)).astype(np.int32)
+    return np.flatnonzero(together(V.mesh.comm, lambda: _marked(marker, V.reference_points))).astype(np.int32)
 
 
 def boundary_dofs(
     V: FunctionSpace | Component, marker: Marker | None = None, *, tag: int | None = None, slope: bool = False
 ) -> Ints:
-    """Return the functions that do not vanish on the boundary or on a part of it.
+    """Return the functions that do not vanish on the boundary or on a part of it; collective.
 
     Args:
         V: The space, or one component of it, which makes no difference.
@@ -75,7 +77,7 @@ def boundary_dofs(
         slope: Also those whose derivative across the boundary does not vanish there: what a clamped plate prescribes.
 
     Returns:
-        Function numbers, ascending, shape (m,), local.
+        Function numbers, ascending, shape (m,), local, ghosts included.
 
     Raises:
         TypeError: If V is no space of splines.
@@ -85,6 +87,11 @@ def boundary_dofs(
     check_space(V, "boundary_dofs")
     if marker is not None and tag is not None:
         raise ValueError("give a marker or a tag, not both")
+    return _on_all_ranks(V, together(V.mesh.comm, lambda: _on_boundary(V, marker, tag, slope)))
+
+
+def _on_boundary(V: FunctionSpace, marker: Marker | None, tag: int | None, slope: bool) -> Ints:
+    """Return what `boundary_dofs` does, but on several ranks of ghosts only those that local cells show."""
     cells = V.cells
     piece, side, edge = cells.boundary_pieces
     chosen = np.ones(piece.size, dtype=bool)
@@ -95,11 +102,11 @@ def boundary_dofs(
         for position in side_points([0.0, 0.5, 1.0])[side].swapaxes(0, 1):
             chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
     rows = side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
-    return np.unique(rows.indices).astype(np.int32)
+    return np.unique(rows.indices)
 
 
 def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: int | None = None) -> Ints:
-    """Return the functions that do not vanish on a set of control-mesh faces, however far these are refined.
+    """Return the functions that do not vanish on a set of control-mesh faces, however far refined; collective.
 
     Args:
         V: The space.
@@ -107,13 +114,18 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
         tag: Or their face tag.
 
     Returns:
-        Function numbers, ascending, shape (m,), local.
+        Function numbers, ascending, shape (m,), local, ghosts included.
 
     Raises:
         TypeError: If the faces are no integers, or V is no space of splines.
         ValueError: If not just one of `faces` and `tag` is given, a face is out of range, or no face has the tag.
     """
     check_space(V, "region_dofs")
+    return _on_all_ranks(V, together(V.mesh.comm, lambda: _in_region(V, faces, tag)))
+
+
+def _in_region(V: FunctionSpace, faces: npt.ArrayLike | None, tag: int | None) -> Ints:
+    """Return what `region_dofs` does, but on several ranks of ghosts only those that local cells show."""
     if (faces is None) == (tag is None):
         raise ValueError("give the faces of the region, or their tag")
     marked = np.zeros(V.mesh.num_faces, dtype=bool)
@@ -128,7 +140,15 @@ def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: in
     cells = V.cells
     dofs = [batch.dofs[marked[cells.face[batch.cells]]].ravel() for batch in cells.batches]
     found = np.unique(np.concatenate(dofs))
-    return found[found >= 0].astype(np.int32)
+    return found[found >= 0]
+
+
+def _on_all_ranks(V: FunctionSpace, found: Ints) -> Ints:
+    """Return those of the local functions that their owners have found, which hold all cells of these."""
+    marks = np.zeros(V.index_map.numbers.size)
+    marks[found] = 1.0
+    V.index_map.scatter_forward(marks)
+    return np.flatnonzero(marks).astype(np.int32)
 
 
 def dirichletbc(
@@ -138,13 +158,13 @@ def dirichletbc(
     *,
     slope: bool = False,
 ) -> DirichletBC:
-    """Prescribe a value on functions.
+    """Prescribe a value on functions; collective.
 
     Args:
         value: A number, an array of values per component (of all functions the same) or per function, a `Constant`, a
             UFL expression, or a callable g(x) with x of shape (3, n). Expressions and callables are projected in L2.
             All are read here and now.
-        dofs: Function numbers, shape (n,).
+        dofs: Function numbers, shape (n,), local, ghosts included: as the functions of this module return them.
         V: The space, or one component `V.sub(c)`; None: that of the value, a `Function`.
         slope: Fit value and slope of a UFL expression on the boundary, for dofs of ``boundary_dofs(V, slope=True)``.
             It must be differentiable there. Numbers need no such thing: 0 on these dofs is value and slope 0.
@@ -159,23 +179,25 @@ def dirichletbc(
     space, component = (V.space, V.component) if isinstance(V, Component) else (V, None)
     if not isinstance(space, FunctionSpace):
         raise TypeError(f"dirichletbc needs a space from fem.functionspace, or V.sub(c), got {type(V).__name__}")
-    dofs = _indices(dofs, "dofs", space.num_functions)
-    functions = np.unique(dofs)
+    comm = space.mesh.comm
+    numbers = together(comm, lambda: _indices(dofs, "dofs", space.index_map.numbers.size))
+    functions = np.unique(numbers)
     components = np.arange(space.block_size) if component is None else np.array([component])
     if isinstance(value, Constant):
         value = value.value
     if isinstance(value, ufl.core.expr.Expr) or callable(value):
         values = fitted(space, functions, value, components.size, slope)
     else:
-        values = _broadcast(np.array(value, dtype=np.float64), dofs, functions, components.size)
-        if not np.isfinite(values).all():
-            raise ValueError(f"the value {value!r} is not finite: prescribe finite values")
-    numbers = space.block_size * functions[:, None] + components
-    return DirichletBC(space, numbers.ravel().astype(np.int32), values.ravel())
+        values = together(comm, lambda: _broadcast(value, numbers, functions, components.size))
+    rows = space.block_size * functions[:, None] + components
+    return DirichletBC(space, rows.ravel().astype(np.int32), values.ravel())
 
 
-def _broadcast(value: Floats, dofs: Indices, functions: Indices, k: int) -> Floats:
+def _broadcast(given: npt.ArrayLike, dofs: Indices, functions: Indices, k: int) -> Floats:
     """Return values of shape (functions, k) from one value, one a component, or one a function."""
+    value = np.array(given, dtype=np.float64)
+    if not np.isfinite(value).all():
+        raise ValueError(f"the value {given!r} is not finite: prescribe finite values")
     if value.ndim == 0 or (value.shape == (k,) and k > 1):
         return np.broadcast_to(value, (functions.size, k))
     if value.shape in ((dofs.size,), (dofs.size, k)):

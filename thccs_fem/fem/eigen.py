@@ -20,9 +20,12 @@ import scipy.sparse as sp
 import ufl
 from thccs_fem.fem.assembly import assemble_matrix
 from thccs_fem.fem.bcs import DirichletBC
+from thccs_fem.fem.entries import Numbering
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Layout
 from thccs_fem.fem.linear import constraints, is_symmetric
+from thccs_fem.parallel import gathered, largest, rank_of, smallest, total
 from thccs_fem.subdivision import Ints
 
 __all__ = ["EigenSystem"]
@@ -47,9 +50,10 @@ class EigenSystem:
         bcs: Conditions; others may be put in their place before the next `assemble`.
         num_eigenvalues: How many eigenvalues are wanted.
         target: They are the nearest to this number.
-        free: Dofs that no condition prescribes, shape (n,).
-        A: Matrix of a, without prescribed dofs, shape (n, n).
+        free: Dofs that no condition prescribes, local, shape (n,).
+        A: Matrix of a, without prescribed dofs; rows of those that this rank owns, columns of ghosts too.
         M: That of m.
+        numbering: PETSc's numbers of the free dofs; None in serial.
     """
 
     def __init__(
@@ -81,10 +85,18 @@ class EigenSystem:
         self.target = target
         self.free: Ints = np.zeros(0, dtype=np.int32)
         self.A = self.M = sp.csr_array((0, 0))
+        self.numbering: Numbering | None = None
+        self._comm = V.mesh.comm
+        self._layout = Layout((V,))
         constraints(bcs, V)  # says early what is wrong with them
 
+    @property
+    def num_owned(self) -> int:
+        """How many free dofs this rank owns."""
+        return self.A.shape[0]
+
     def assemble(self) -> None:
-        """Assemble both matrices with the present values of coefficients, constants and conditions.
+        """Assemble both matrices with the present values of coefficients, constants and conditions; collective.
 
         Raises:
             ValueError: A matrix is not symmetric, that of m not positive, a prescribed value not zero, or there are not
@@ -92,24 +104,27 @@ class EigenSystem:
         """
         V = self.a.spaces[1]
         dofs, values = constraints(self.bcs, V)
-        if values.any():
+        largest_value = largest(self._comm, np.abs(values).max(initial=0.0))
+        if largest_value > 0.0:
             raise ValueError(
-                f"conditions prescribe values up to {np.abs(values).max():g}: eigenfunctions vanish where something is "
+                f"conditions prescribe values up to {largest_value:g}: eigenfunctions vanish where something is "
                 f"prescribed, so prescribe 0.0"
             )
-        self.free = np.setdiff1d(np.arange(V.num_dofs, dtype=np.int32), dofs)
-        if self.num_eigenvalues >= self.free.size:
+        self.free = np.setdiff1d(np.arange(V.num_local_dofs, dtype=np.int32), dofs)
+        self.numbering = self._numbered()
+        size = self.free.size if self.numbering is None else int(self.numbering.starts[-1])
+        if self.num_eigenvalues >= size:
             raise ValueError(
-                f"{self.num_eigenvalues} eigenvalues are wanted of {self.free.size} dofs without a condition: refine "
-                f"the space, or ask for fewer"
+                f"{self.num_eigenvalues} eigenvalues are wanted of {size} dofs without a condition: refine the space, "
+                f"or ask for fewer"
             )
         self.A, self.M = (self._matrix(compiled) for compiled in (self.a, self.m))
         for name, matrix in (("a", self.A), ("m", self.M)):
-            if not is_symmetric(matrix):
+            if not is_symmetric(matrix, self.numbering):
                 raise ValueError(
                     f"{name} is not symmetric, so that eigenvalues may be complex: only symmetric forms are implemented"
                 )
-        if not (self.M.diagonal() > 0.0).all():
+        if not smallest(self._comm, self.M.diagonal().min(initial=np.inf)) > 0.0:
             raise ValueError(
                 "m is not positive: eigenvalues need a norm. If a is positive, swap the forms: the eigenvalues become "
                 "their inverses"
@@ -127,11 +142,14 @@ class EigenSystem:
         """
         V = self.a.spaces[1]
         points = V.reference_points
-        extents = np.ptp(points, axis=0)
-        along = points[:, int(np.argmax(extents))]
-        wave = np.cos(np.pi * (along - along.min()) / extents.max())
+        ends = gathered(self._comm, np.stack([points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)]))
+        extents = np.ptp(ends, axis=0)
+        along = int(np.argmax(extents))
+        wave = np.cos(np.pi * (points[:, along] - ends[:, along].min()) / extents.max())
         w = np.repeat(wave, V.block_size)[self.free]
-        return self.target - AWAY * abs(float(w @ (self.A @ w) / (w @ (self.M @ w))))
+        owned = w[: self.num_owned]
+        quotient = total(self._comm, float(owned @ (self.A @ w))) / total(self._comm, float(owned @ (self.M @ w)))
+        return self.target - AWAY * abs(quotient)
 
     def complete(
         self, search: Search, count: Callable[[float], int] | None, accuracy: float = 0.0
@@ -142,23 +160,23 @@ class EigenSystem:
 
         Args:
             search: Returns at least as many eigenvalues as wanted, if they converge, and their vectors as columns, from
-                their number, the vectors (shape (n, k)) to which theirs are to be m-orthogonal, and a vector to start
-                from.
+                their number, the vectors (shape (num_owned, k)) to which theirs are to be m-orthogonal, and a vector to
+                start from.
             count: Returns how many eigenvalues there are below a number; None: what the first search finds is taken.
             accuracy: Of the eigenvalues found, relative to their distances from the target.
 
         Returns:
-            Eigenvalues, those wanted first, shape (k,), and their vectors, shape (n, k).
+            Eigenvalues, those wanted first, shape (k,), and their vectors, shape (num_owned, k).
 
         Raises:
             RuntimeError: The numbers of those found and those counted never agree.
         """
-        values, vectors = np.zeros(0), np.zeros((self.free.size, 0))
+        values, vectors = np.zeros(0), np.zeros((self.num_owned, 0))
         missing = self.num_eigenvalues
         if count is None:
-            return search(missing, vectors, _start_vector(self.M, 0))
+            return search(missing, vectors, self._start_vector(0))
         for seed in range(ROUNDS):
-            more = search(missing, vectors, _start_vector(self.M, seed))
+            more = search(missing, vectors, self._start_vector(seed))
             values, vectors = np.append(values, more[0]), np.hstack([vectors, more[1]])
             nearest = np.argsort(np.abs(values - self.target), kind="stable")
             values, vectors = values[nearest], vectors[:, nearest]
@@ -184,8 +202,8 @@ class EigenSystem:
             relative: Difference of distances from the target that count as one.
         """
         distances = np.abs(eigenvalues - self.target)[: self.num_eigenvalues]
-        largest = (np.abs(self.A.diagonal()) / self.M.diagonal()).max()
-        same = max(relative * distances[-1], ROUNDING * largest)
+        ratios = np.abs(self.A.diagonal()) / self.M.diagonal()
+        same = max(relative * distances[-1], ROUNDING * largest(self._comm, ratios.max(initial=0.0)))
         first = int(np.flatnonzero(np.diff(distances, prepend=-np.inf) > same)[-1])  # of the last one's copies
         radius = distances[first] - same / 2.0
         if radius <= 0.0:
@@ -197,7 +215,7 @@ class EigenSystem:
 
         Args:
             eigenvalues: Those that converged, those wanted first, shape (k,).
-            vectors: Eigenvectors, shape (n, k).
+            vectors: Eigenvectors, shape (num_owned, k).
             solver: Who found them, for messages.
 
         Raises:
@@ -212,18 +230,44 @@ class EigenSystem:
         return eigenvalues[order], [self._function(vectors[:, i]) for i in order]
 
     def _function(self, vector: Floats) -> Function:
-        """Return an eigenfunction; the first of its largest coefficients is positive."""
-        x = vector / np.sqrt(vector @ (self.M @ vector))
-        largest = np.flatnonzero(np.abs(x) >= (1.0 - EQUAL) * np.abs(x).max())[0]
-        function = Function(self.a.spaces[1])
-        function.x.array[self.free] = x * np.sign(x[largest])
+        """Return an eigenfunction; the first of its largest coefficients, by dofs of the whole, is positive."""
+        V, owned = self.a.spaces[1], self.free[: self.num_owned]
+        x = vector / np.sqrt(total(self._comm, float(vector @ (self.M @ self._with_ghosts(vector)))))
+        size = largest(self._comm, np.abs(x).max(initial=0.0))
+        candidates = np.flatnonzero(np.abs(x) >= (1.0 - EQUAL) * size)
+        dofs = V.block_size * V.index_map.numbers[owned // V.block_size] + owned % V.block_size
+        first = smallest(self._comm, float(dofs[candidates].min(initial=V.num_dofs)))
+        function = Function(V)
+        function.x.array[owned] = x * total(self._comm, float(np.sign(x[dofs == first]).sum()))
+        function.x.scatter_forward()
         return function
 
     def _matrix(self, compiled: Form) -> sp.csr_array:
         whole = assemble_matrix(compiled)
-        return whole if self.free.size == whole.shape[0] else sp.csr_array(whole[self.free][:, self.free])
+        if self.free.size == whole.shape[1]:
+            return whole
+        return sp.csr_array(whole[self.free[self.free < whole.shape[0]]][:, self.free])
 
+    def _numbered(self) -> Numbering | None:
+        """Return the numbers of the free dofs."""
+        V = self.a.spaces[1]
+        if V.index_map.is_whole:
+            return None
+        owned = self.free[self.free < V.num_owned_dofs]
+        starts = np.concatenate([[0], np.cumsum(gathered(self._comm, np.array([owned.size])))])
+        numbers = np.zeros(V.num_owned_dofs)
+        numbers[owned] = starts[self._comm.rank] + np.arange(owned.size)
+        return Numbering(self._comm, starts, self._layout.with_ghosts(numbers)[self.free].astype(np.int32))
 
-def _start_vector(M: sp.csr_array, seed: int) -> Floats:
-    """Return what Krylov methods start from: the same for the same seed, with a part along every eigenvector."""
-    return np.asarray(M @ np.random.default_rng(seed).standard_normal(M.shape[0]))
+    def _with_ghosts(self, x: Floats) -> Floats:
+        """Return the values at all free dofs from those that this rank owns; collective."""
+        if self.numbering is None:
+            return x
+        values = np.zeros(self._layout.num_owned)
+        values[self.free[: self.num_owned]] = x
+        return self._layout.with_ghosts(values)[self.free]
+
+    def _start_vector(self, seed: int) -> Floats:
+        """Return what Krylov methods start from: the same for the same seed, with a part along every eigenvector."""
+        rng = np.random.default_rng(seed + ROUNDS * rank_of(self._comm))
+        return np.asarray(self.M @ self._with_ghosts(rng.standard_normal(self.num_owned)))

@@ -13,6 +13,7 @@ from thccs_fem import jit
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
+from thccs_fem.parallel import together
 from thccs_fem.subdivision import Ints
 
 __all__ = ["Expression", "ValueOrExpression", "values_at"]
@@ -46,7 +47,11 @@ class Expression:
         self._constants: list[Constant] = ufl.algorithms.analysis.extract_constants(expression)
 
     def eval(self, V: FunctionSpace, pieces: Ints) -> Floats:
-        """Evaluate on pieces of V, whose hierarchy must be that of the Functions in the expression or finer.
+        """Evaluate on pieces of V, whose hierarchy must be that of Functions in the expression or finer; collective.
+
+        Args:
+            V: The space.
+            pieces: Numbers of its pieces, local: each rank may ask for others, also for none.
 
         Returns:
             Shape (pieces, m, components).
@@ -54,7 +59,8 @@ class Expression:
         Raises:
             ValueError: If a Function lives in a space that V does not refine.
         """
-        local = [_local(u, V)[pieces].reshape(pieces.size, -1) for u in self._coefficients]
+        all_local = [_local(u, V) for u in self._coefficients]
+        local = [of_pieces[pieces].reshape(pieces.size, int(np.prod(of_pieces.shape[1:]))) for of_pieces in all_local]
         w = np.concatenate([np.zeros((pieces.size, 0)), *local], axis=1)
         c = np.concatenate([np.zeros(0), *(constant.value.ravel() for constant in self._constants)])
         x = np.zeros((pieces.size, 16, 3))
@@ -86,12 +92,12 @@ def _local(u: Function, V: FunctionSpace) -> Floats:
 
 
 def values_at(value: ValueOrExpression, V: FunctionSpace, pieces: Ints, points: Floats, k: int) -> Floats:
-    """Return values with k components at reference points of pieces.
+    """Return values with k components at reference points of pieces; collective.
 
     Args:
         value: UFL expression, or callable g(x) with x of shape (3, n) that returns (n,) or (k, n).
         V: The space whose pieces are meant.
-        pieces: Pieces, shape (n,).
+        pieces: Pieces, shape (n,), local.
         points: Points in [0, 1]^2, shape (m, 2).
         k: Components.
 
@@ -111,10 +117,16 @@ def values_at(value: ValueOrExpression, V: FunctionSpace, pieces: Ints, points: 
     piece = np.repeat(pieces, len(points))
     x = np.zeros((3, piece.size))
     x[: V.mesh.gdim] = evaluate_pieces(V.cells.piece_points, piece, np.tile(points, (pieces.size, 1))).T
-    values = np.asarray(value(x), dtype=np.float64)
-    if values.shape not in ((piece.size,), (k, piece.size)):
-        raise ValueError(
-            f"g(x) returned shape {values.shape} for x of shape {x.shape}; it must return ({piece.size},) or ({k}, "
-            f"{piece.size})"
-        )
+    values = together(V.mesh.comm, lambda: _called(value, x, k))
     return np.ascontiguousarray(np.broadcast_to(values, (k, piece.size)).T).reshape(pieces.size, len(points), k)
+
+
+def _called(value: Callable[[Floats], npt.ArrayLike], x: Floats, k: int) -> Floats:
+    """Return g(x), shape (n,) or (k, n)."""
+    values = np.asarray(value(x), dtype=np.float64)
+    n = x.shape[1]
+    if values.shape not in ((n,), (k, n)):
+        raise ValueError(
+            f"g(x) returned shape {values.shape} for x of shape {x.shape}; it must return ({n},) or ({k}, {n})"
+        )
+    return values

@@ -2,6 +2,9 @@
 
 No spline interpolates: an expression is projected, in L2 of the boundary edges that the given functions determine, or
 of the cells if not all of them reach the boundary. Value and slope are fitted on the boundary together.
+
+On several ranks each evaluates on the cells that it owns; then all of them have all of that, in the order of the
+hierarchy, and solve the same equations.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from thccs_fem import element
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import gathered
 from thccs_fem.positions import side_points
 from thccs_fem.subdivision import Bools, Ints
 
@@ -36,7 +40,7 @@ Indices = npt.NDArray[np.integer]
 
 
 def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, slope: bool) -> Floats:
-    """Return the coefficients of the L2 projection of an expression on functions.
+    """Return the coefficients of the L2 projection of an expression on functions; collective.
 
     What is fitted by least squares is the value (and the slope) on the part of the boundary or of the surface that the
     given functions determine, together with all other functions there, and, with a small weight, the value around it:
@@ -44,7 +48,7 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
 
     Args:
         V: The space.
-        functions: Function numbers, ascending, shape (n,).
+        functions: Function numbers, ascending, shape (n,), local, ghosts included.
         value: UFL expression, or callable g(x) with x of shape (3, m).
         k: Number of its components.
         slope: Whether the slope on the boundary is fitted as well.
@@ -57,12 +61,14 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
         ValueError: The value has another shape, or is not finite where the functions determine it; or the slope is
             wanted for functions that have neither value nor slope on the boundary.
     """
-    if not functions.size:
+    numbers = V.index_map.numbers[functions]
+    given = np.unique(gathered(V.mesh.comm, numbers))
+    if not given.size:
         return np.zeros((0, k))
     if slope:
-        parts = [_value_and_slope(V, functions, value, k), _on_cells(V, functions, value, k, is_around=True)]
+        parts = [_value_and_slope(V, given, value, k), _on_cells(V, given, value, k, is_around=True)]
     else:
-        parts = [_on_boundary(V, functions, value, k) or _on_cells(V, functions, value, k)]
+        parts = [_on_boundary(V, given, value, k) or _on_cells(V, given, value, k)]
     mass, load = parts[0].equations()
     for part in parts[1:]:
         more_mass, more_load = part.equations()
@@ -74,7 +80,7 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
     factors = spla.splu(regular)
     fitted = factors.solve(load)
     fitted += factors.solve(load - mass @ fitted)  # takes back what RIDGE has changed
-    return fitted[np.searchsorted(present, functions)]
+    return fitted[np.searchsorted(present, numbers)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,41 +88,76 @@ class _Part:
     """Values at points of n sides or pieces, in each of which there are m local functions.
 
     Attributes:
+        keys: What orders the sides or pieces, shape (n,).
         rows: Local coefficients of all functions, shape (n m, num_functions).
-        basis: Local functions at the points, shape (n or 1, points, m).
+        basis: Local functions at the points, shape (n, points, m), or (points, m) if they are the same in all.
         weights: Weights of the points, shape (n, points).
         values: What is to be fitted there, shape (n, points, k).
+        is_inside: Whether the given functions alone determine it; else it is around what is prescribed, shape (n,).
     """
 
+    keys: npt.NDArray[np.int64]
     rows: sp.csr_array
     basis: Floats
     weights: Floats
     values: Floats
+    is_inside: Bools
 
     def equations(self) -> tuple[sp.csr_array, Floats]:
-        """Return matrix and right-hand side of the least squares, of all functions."""
+        """Return matrix and right-hand side of the least squares, of all functions.
+
+        Raises:
+            ValueError: A value is not finite inside.
+        """
         is_finite = np.isfinite(self.values).all(axis=2, keepdims=True)  # around the part, it need not be defined
-        weighted = (np.where(is_finite, self.weights[:, :, None], 0.0) * self.basis).swapaxes(1, 2)
+        bad = np.count_nonzero(~is_finite.all(axis=(1, 2)) & self.is_inside)
+        if bad:
+            raise ValueError(
+                f"the value is not finite on {bad} of the {np.count_nonzero(self.is_inside)} edges or patches of "
+                f"surface that the dofs determine: prescribe finite values"
+            )
+        weights = self.weights * np.where(self.is_inside, 1.0, AROUND)[:, None]
+        weighted = (np.where(is_finite, weights[:, :, None], 0.0) * self.basis).swapaxes(1, 2)
         mass, load = weighted @ self.basis, weighted @ np.where(is_finite, self.values, 0.0)
         n, m, _ = mass.shape
         blocks = sp.bsr_array((mass, np.arange(n), np.arange(n + 1)), shape=(n * m, n * m))
         return sp.csr_array(self.rows.T @ (blocks.tocsr() @ self.rows)), self.rows.T @ load.reshape(n * m, -1)
 
 
-def _on_boundary(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> _Part | None:
+def _of_all_ranks(V: FunctionSpace, part: _Part) -> _Part:
+    """Return a part with local functions in its rows as that of all ranks, the same on each, in the order of its keys.
+
+    So sums over it are those of a serial run to the last bit, which matters where functions are hardly determined.
+    """
+    comm, functions = V.mesh.comm, V.index_map
+    keys = gathered(comm, part.keys)
+    order = np.argsort(keys)
+    sizes, indices, data = (
+        gathered(comm, array)
+        for array in (np.diff(part.rows.indptr), functions.numbers[part.rows.indices], part.rows.data)
+    )
+    rows = sp.csr_array((data, indices, np.append(0, np.cumsum(sizes))), shape=(sizes.size, functions.size_global))
+    height = part.basis.shape[-1]
+    basis = part.basis if part.basis.ndim == 2 else gathered(comm, part.basis)[order]
+    weights, values = (gathered(comm, array)[order] for array in (part.weights, part.values))
+    is_inside = gathered(comm, part.is_inside)[order]
+    return _Part(keys[order], _rows_of(rows, order, height), basis, weights, values, is_inside)
+
+
+def _on_boundary(V: FunctionSpace, given: Indices, value: ValueOrExpression, k: int) -> _Part | None:
     """Return the values at Gauss points of the boundary; None if a function has no trace there."""
-    piece, side, _ = V.cells.boundary_pieces
+    piece, side = _own_sides(V.cells)
     rows = side_rows(V.cells, piece, side, depth=1)
-    if not np.isin(functions, rows.indices).all():
+    if _without_rows(V, given, rows).size:
         return None
-    chosen, is_inside = _blocks(rows, functions, 4)
+    chosen, is_inside = _blocks(V, rows, given, 4)
     sides = _Sides(V, piece[chosen], side[chosen])
     values = sides.values_of(value, k)
-    weights = _weighted(sides.lengths, values, is_inside)
-    return _Part(_rows_of(rows, chosen, 4), element.bernstein_values(sides.t)[None], weights, values)
+    basis = element.bernstein_values(sides.t)
+    return _of_all_ranks(V, _Part(sides.keys, _rows_of(rows, chosen, 4), basis, sides.lengths, values, is_inside))
 
 
-def _value_and_slope(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int) -> _Part:
+def _value_and_slope(V: FunctionSpace, given: Indices, value: ValueOrExpression, k: int) -> _Part:
     """Return the values at Gauss points of the boundary, then h times the slopes there.
 
     h is the width of the piece across the boundary, so that values and slopes weigh alike at every size of the cells.
@@ -127,45 +168,85 @@ def _value_and_slope(V: FunctionSpace, functions: Indices, value: ValueOrExpress
     """
     if not isinstance(value, ufl.core.expr.Expr):
         raise TypeError(f"slope=True needs a UFL expression, whose gradient is known, got {type(value).__name__}")
-    piece, side, _ = V.cells.boundary_pieces
+    piece, side = _own_sides(V.cells)
     rows = side_rows(V.cells, piece, side, depth=2)
-    inside = functions[~np.isin(functions, rows.indices)]
+    inside = _without_rows(V, given, rows)
     if inside.size:
         raise ValueError(
-            f"{inside.size} of the {functions.size} dofs have neither value nor slope on the boundary, the first is "
+            f"{inside.size} of the {given.size} dofs have neither value nor slope on the boundary, the first is "
             f"{inside[0]}: slope=True is for dofs of boundary_dofs(V, slope=True)"
         )
-    chosen, is_inside = _blocks(rows, functions, 8)
+    chosen, is_inside = _blocks(V, rows, given, 8)
     sides = _Sides(V, piece[chosen], side[chosen])
     values = sides.values_of(value, k)
     gradients = sides.values_of(ufl.grad(value), k * V.mesh.gdim).reshape(*values.shape, V.mesh.gdim)
     slopes = np.einsum("nqkc,nqc->nqk", gradients, sides.across)
     both = np.concatenate([values, slopes], axis=1)
-    weights = _weighted(np.tile(sides.lengths, 2), both, is_inside)
-    return _Part(_rows_of(rows, chosen, 8), sides.value_and_slope(), weights, both)
+    weights = np.tile(sides.lengths, 2)
+    return _of_all_ranks(
+        V, _Part(sides.keys, _rows_of(rows, chosen, 8), sides.value_and_slope(), weights, both, is_inside)
+    )
 
 
-def _on_cells(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: int, is_around: bool = False) -> _Part:
+def _on_cells(V: FunctionSpace, given: Indices, value: ValueOrExpression, k: int, is_around: bool = False) -> _Part:
     """Return the values at Gauss points of the pieces that the functions live on.
 
     With `is_around` all of them are around what is prescribed.
     """
     cells = V.cells
-    all_rows = cells.rows(np.arange(cells.num_pieces, dtype=np.int32))
-    piece, is_inside = _blocks(all_rows, functions, 16)
+    near = _own_pieces_near(V, given)
+    all_rows = cells.rows(near)
+    chosen, is_inside = _blocks(V, all_rows, given, 16)
     is_inside &= not is_around
+    piece = near[chosen]
     t, w = _gauss()
     points = np.stack(np.meshgrid(t, t, indexing="ij"), axis=-1).reshape(-1, 2)
     weights = cells.area_element(piece, points) * np.outer(w, w).ravel()
     values = values_at(value, V, piece, points, k)
-    basis = element.bicubic_values(points)[None]
-    return _Part(_rows_of(all_rows, piece, 16), basis, _weighted(weights, values, is_inside), values)
+    basis = element.bicubic_values(points)
+    keys = _piece_keys(cells)[piece]
+    return _of_all_ranks(V, _Part(keys, _rows_of(all_rows, chosen, 16), basis, weights, values, is_inside))
 
 
-def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
+def _own_sides(cells: Cells) -> tuple[Ints, Ints]:
+    """Return the pieces of this rank's own cells on the boundary, and their sides there, both (n,)."""
+    piece, side, _ = cells.boundary_pieces
+    own = cells.piece_cell[piece] < cells.num_owned
+    return piece[own], side[own]
+
+
+def _own_pieces_near(V: FunctionSpace, given: Indices) -> Ints:
+    """Return the pieces of those of this rank's own cells on which given functions may not vanish."""
+    cells = V.cells
+    offsets, dofs = cells.cell_dofs
+    cell = np.repeat(np.arange(cells.num_cells), np.diff(offsets))
+    is_near = np.zeros(cells.num_cells, dtype=bool)
+    is_near[cell[np.isin(V.index_map.numbers[dofs], given)]] = True
+    is_near[cells.num_owned :] = False
+    return np.flatnonzero(is_near[cells.piece_cell]).astype(np.int32)
+
+
+def _piece_keys(cells: Cells) -> npt.NDArray[np.int64]:
+    """Return a number for each piece by its level and face, the same on all ranks, shape (num_pieces,)."""
+    keys = np.zeros(cells.num_pieces, dtype=np.int64)
+    first = 0
+    for piece_of_face in cells.piece_of_face:
+        held = np.flatnonzero(piece_of_face >= 0)
+        keys[piece_of_face[held]] = first + held
+        first += piece_of_face.size
+    return keys
+
+
+def _without_rows(V: FunctionSpace, given: Indices, rows: sp.csr_array) -> Indices:
+    """Return those of the given functions that have no entry in the rows of any rank."""
+    numbers = V.index_map.numbers[np.unique(rows.indices)]
+    found = gathered(V.mesh.comm, numbers[np.isin(numbers, given)])
+    return given[~np.isin(given, found)]
+
+
+def _blocks(V: FunctionSpace, rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, Bools]:
     """Return the blocks of `height` rows where given functions occur, and in which of these no others do."""
-    given = np.zeros(rows.shape[1], dtype=bool)
-    given[functions] = True
+    given = np.isin(V.index_map.numbers, functions)
     block = np.repeat(np.arange(rows.shape[0]) // height, np.diff(rows.indptr))
     num_given, num_foreign = (
         np.bincount(block, weights=marks[rows.indices], minlength=rows.shape[0] // height) for marks in (given, ~given)
@@ -174,20 +255,9 @@ def _blocks(rows: sp.csr_array, functions: Indices, height: int) -> tuple[Ints, 
     return chosen, num_foreign[chosen] == 0
 
 
-def _rows_of(rows: sp.csr_array, blocks: Ints, height: int) -> sp.csr_array:
+def _rows_of(rows: sp.csr_array, blocks: Indices, height: int) -> sp.csr_array:
     """Return blocks of `height` rows."""
     return sp.csr_array(rows[(height * blocks[:, None] + np.arange(height)).ravel()])
-
-
-def _weighted(weights: Floats, values: Floats, is_inside: Bools) -> Floats:
-    """Return the weights of shape (n, points), made small outside."""
-    bad = ~np.isfinite(values).all(axis=(1, 2)) & is_inside
-    if bad.any():
-        raise ValueError(
-            f"the value is not finite on {np.count_nonzero(bad)} of the {np.count_nonzero(is_inside)} edges or patches "
-            f"of surface that the dofs determine: prescribe finite values"
-        )
-    return weights * np.where(is_inside, 1.0, AROUND)[:, None]
 
 
 # ---- Sides of pieces ----------------------------------------------------------------------------------------------
@@ -232,6 +302,11 @@ class _Sides:
         )
         self.tangent = np.einsum("qi,nic->nqc", element.bernstein_slopes(self.t), first)
         self.inward = np.einsum("qi,nic->nqc", element.bernstein_values(self.t), 3.0 * (second - first))
+
+    @property
+    def keys(self) -> npt.NDArray[np.int64]:
+        """A number for each side, the same on all ranks, shape (n,)."""
+        return 4 * _piece_keys(self.V.cells)[self.piece] + self.side
 
     @property
     def lengths(self) -> Floats:

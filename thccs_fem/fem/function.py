@@ -197,13 +197,14 @@ class Function(ufl.Coefficient):
 
 
 def cell_sizes(V: FunctionSpace) -> Function:
-    """Return the sizes of the cells of V, each the root of its area, as a function that is constant on each cell."""
+    """Return the sizes of the cells of V, each the root of its area, constant on each cell; collective."""
     cells = V.cells
     t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
     points = np.stack(np.meshgrid((t + 1.0) / 2.0, (t + 1.0) / 2.0), axis=-1).reshape(-1, 2)
     areas = cells.area_element(np.arange(cells.num_pieces, dtype=np.int32), points) @ np.outer(w, w).ravel() / 4.0
     h = Function(cellwise(V), name="h")
     h.x.array = np.sqrt(np.bincount(cells.piece_cell, weights=areas, minlength=cells.num_cells))
+    h.x.scatter_forward()  # ghosts are right but for rounding
     return h
 
 

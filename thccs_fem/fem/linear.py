@@ -6,7 +6,7 @@ so that a symmetric matrix stays symmetric, and what the columns held goes to th
 On a closed surface without conditions, and for pure Neumann problems, constants are in the kernel of the matrix. Then
 the load must have mean zero, and the solution that has mean zero is wanted.
 
-On several ranks vectors have the dofs that a rank owns, and sums go over all ranks: see `blocks.Layout`.
+On several ranks vectors have the dofs that a rank owns, and sums go over all ranks: see `layout`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ import scipy.sparse as sp
 import ufl
 from thccs_fem.fem import blocks
 from thccs_fem.fem.assembly import integrals
-from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout, constraints
+from thccs_fem.fem.blocks import BlockMatrix
 from thccs_fem.fem.checks import lowered
-from thccs_fem.fem.entries import at_owners
+from thccs_fem.fem.entries import Numbering, at_owners
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Conditions, Layout, constraints
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import gathered, largest, rank_of, smallest, together, total
 from thccs_fem.subdivision import Bools, Ints
@@ -81,7 +82,7 @@ class LinearSystem:
     ):
         bilinear = blocks.rows(a)
         linear = blocks.columns(L, len(bilinear))
-        self.layout = blocks.Layout(blocks.spaces_of(bilinear, linear))
+        self.layout = Layout(blocks.spaces_of(bilinear, linear))
         spaces = self.layout.spaces
         self.a = [blocks.compiled(row, spaces) for row in bilinear]
         self.L = blocks.compiled(linear, spaces)
@@ -125,7 +126,7 @@ class LinearSystem:
         else:
             self._matrix.assemble()
         A = self._matrix.whole
-        self.b[:] = self.layout.vector(self.L) + together(self.layout.comm, self._checked_load)
+        self.b[:] = blocks.vector(self.L, self.layout) + together(self.layout.comm, self._checked_load)
         if self._dofs.size:
             prescribed = np.zeros(self.layout.num_local)
             prescribed[self._dofs] = self._values
@@ -157,13 +158,13 @@ class LinearSystem:
         """Return what is added to b of the dofs that this rank owns."""
         if self.load is None:
             return 0.0
-        load, n = np.asarray(self.load, dtype=np.float64), self.layout.num_local
+        sizes = [V.num_local_dofs for V in self.layout.spaces]
+        load, n = np.asarray(self.load, dtype=np.float64), sum(sizes)
         if load.shape != (n,):
             where = "" if self.layout.is_whole else " on this rank, ghosts included"
             raise ValueError(f"load has shape {load.shape}, but there are {n} dofs{where}: give ({n},)")
-        spaces = self.layout.spaces
-        ends = np.cumsum([V.num_local_dofs for V in spaces])
-        return np.concatenate([x[: V.num_owned_dofs] for x, V in zip(np.split(load, ends[:-1]), spaces, strict=True)])
+        parts = zip(np.split(load, np.cumsum(sizes)[:-1]), self.layout.spaces, strict=True)
+        return np.concatenate([part[: V.num_owned_dofs] for part, V in parts])
 
 
 # ---- Dirichlet conditions --------------------------------------------------------------------------------------------
@@ -361,34 +362,34 @@ def _parts(layout: Layout) -> Ints:
 # ---- Has it worked? --------------------------------------------------------------------------------------------------
 
 
-def is_symmetric(A: sp.csr_array, layout: Layout | None = None) -> bool:
+def is_symmetric(A: sp.csr_array, numbering: Numbering | None = None) -> bool:
     """Return whether a matrix is symmetric up to rounding; collective.
 
     Args:
         A: The matrix.
-        layout: Its dofs; None in serial.
+        numbering: Its dofs; None in serial.
     """
-    if layout is None or layout.is_whole:
+    if numbering is None:
         return bool(abs(A - A.T).max() <= SYMMETRIC * abs(A).max())
     n = A.shape[0]
     own, others = A[:, :n], A[:, n:]
-    difference = max(_largest(own - own.T), _largest(others - _transposed(others, layout)))
-    return largest(layout.comm, difference) <= SYMMETRIC * largest(layout.comm, _largest(A))
+    difference = max(_largest(own - own.T), _largest(others - _transposed(others, numbering)))
+    return largest(numbering.comm, difference) <= SYMMETRIC * largest(numbering.comm, _largest(A))
 
 
 def _largest(A: sp.csr_array) -> float:
     return float(np.abs(A.data).max(initial=0.0))
 
 
-def _transposed(A: sp.csr_array, layout: Layout) -> sp.csr_array:
+def _transposed(A: sp.csr_array, numbering: Numbering) -> sp.csr_array:
     """Return what other ranks have in the columns of this rank's dofs, as A has what this one has in theirs."""
-    own, ghosts = np.split(layout.global_numbers, [A.shape[0]])
+    own, ghosts = np.split(numbering.numbers, [A.shape[0]])
     entries = A.tocoo()
-    rows, columns, values = at_owners(
-        layout.comm, layout.starts, ghosts[entries.col], own[entries.row], np.asarray(entries.data)
-    )
-    place = np.searchsorted(ghosts, columns)  # patterns are symmetric: all are there
-    return sp.csr_array((values, (rows - own[0] if own.size else rows, place)), shape=A.shape)
+    rows, columns = ghosts[entries.col], own[entries.row]
+    rows, columns, values = at_owners(numbering.comm, numbering.starts, rows, columns, np.asarray(entries.data))
+    # Patterns are symmetric: all are there.
+    places = np.searchsorted(own, rows), np.searchsorted(ghosts, columns)
+    return sp.csr_array((values, places), shape=A.shape)
 
 
 def norm(comm: Any, x: Floats) -> float:

@@ -16,10 +16,12 @@ import scipy.sparse as sp
 
 import ufl
 from thccs_fem.fem import blocks
-from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout
+from thccs_fem.fem.blocks import BlockMatrix
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.linear import PRESCRIBED, Constants, constrain, drops_constants, unfixed_constants
+from thccs_fem.fem.layout import Conditions, Layout
+from thccs_fem.fem.linear import PRESCRIBED, Constants, constrain, drops_constants, norm, unfixed_constants
+from thccs_fem.parallel import total
 from ufl.algorithms import expand_derivatives
 
 __all__ = ["NonlinearSystem", "failure"]
@@ -116,28 +118,31 @@ class NonlinearSystem:
             tolerance = np.where(self._drops, PRESCRIBED, -1.0)  # a Jacobian that happens to be singular is no reason
             self.constants = unfixed_constants(self.A, self.layout, tolerance, self._dofs)
         if self.constants is not None:
-            b = self.layout.vector(self.residuals)
+            b = blocks.vector(self.residuals, self.layout)
             if not self.is_rounding(x, b):
                 self.constants.check_load(b)
         return x
 
     def residual(self, x: Floats) -> Floats:
-        """Return the residual for coefficients x, which become those of the unknowns."""
+        """Return the residual for coefficients x, which become those of the unknowns; collective."""
         self.layout.spread(x, self.unknowns)
-        b = self.layout.vector(self.residuals)
-        jump = np.zeros(x.size)
-        jump[self._dofs] = self._values - x[self._dofs]
-        if (np.abs(jump[self._dofs]) > MET * (np.abs(self._values) + np.abs(x[self._dofs]))).any():
+        b = blocks.vector(self.residuals, self.layout)
+        present = self.layout.with_ghosts(x)[self._dofs]
+        jump = np.zeros(self.layout.num_local)
+        jump[self._dofs] = self._values - present
+        missed = (np.abs(self._values - present) > MET * (np.abs(self._values) + np.abs(present))).any()
+        if total(self.layout.comm, int(missed)):
             # Not in `A`, which may still be in use: solvers may keep a Jacobian for several steps.
-            b += BlockMatrix(self.jacobians, self.layout.spaces).whole @ jump
-        b[self._dofs] = -jump[self._dofs]
+            b += BlockMatrix(self.jacobians, self.layout).whole @ jump
+        owned = self._dofs[self._dofs < x.size]
+        b[owned] = -jump[owned]
         return b if self.constants is None else self.constants.cleared(b)
 
     def jacobian(self, x: Floats) -> sp.csr_array:
         """Return the Jacobian for coefficients x, which become those of the unknowns; rows of conditions are I's."""
         self.layout.spread(x, self.unknowns)
         if self._matrix is None:
-            self._matrix = BlockMatrix(self.jacobians, self.layout.spaces)
+            self._matrix = BlockMatrix(self.jacobians, self.layout)
         else:
             self._matrix.assemble()
         constrain(self._matrix.whole, self._dofs)
@@ -149,12 +154,14 @@ class NonlinearSystem:
 
     def is_rounding(self, x: Floats, b: Floats) -> bool:
         """Return whether a residual is as small as rounding lets it be, by the last Jacobian."""
-        return bool(np.linalg.norm(b) <= ROUNDING * np.linalg.norm(abs(self.A) @ np.abs(x)))
+        comm, size = self.layout.comm, np.abs(self.layout.with_ghosts(x))
+        return norm(comm, b) <= ROUNDING * norm(comm, abs(self.A) @ size)
 
     def accept(self, x: Floats) -> Any:
         """Return the unknowns with coefficients x, prescribed values exact, free means zero."""
         x = x.copy() if self.constants is None else self.constants.with_mean_zero(x)
-        x[self._dofs] = self._values
+        owned = np.searchsorted(self._dofs, x.size)
+        x[self._dofs[:owned]] = self._values[:owned]
         self.layout.spread(x, self.unknowns)
         return self.u
 

@@ -18,9 +18,13 @@ from thccs_fem.fem.assembly import assemble_cells, assemble_matrix, assemble_vec
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.scipy.linear import conjugate_gradients, solver
+from thccs_fem.fem.mass import conjugate_gradients, product
+from thccs_fem.fem.scipy.linear import solver
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
+from thccs_fem.index_map import Fetch
+from thccs_fem.parallel import together, total
+from thccs_fem.prolongation import Prolongation
 
 __all__ = ["Projection", "project", "projector"]
 
@@ -30,11 +34,11 @@ Norm = Literal["L2", "H1"]
 Rule = Callable[[Hierarchy], Cells]
 
 DEGREE = 11  # of the quadrature, 6 x 6 points: the same on both sides, so that functions of V stay what they are
-TOLERANCE = 1e-13  # mass matrices are scaled by their diagonal: 100 to 300 iterations on any mesh and refinement
+TOLERANCE = 1e-13  # where a matrix that is made is too large to be factorised
 
 
 def project(value: ValueOrExpression, V: FunctionSpace | CellwiseSpace) -> Function:
-    """Return the L2 projection: of all functions of V the one nearest to a value, in the L2 norm over the surface.
+    """Return the L2 projection: of all functions of V the one nearest to a value, in the L2 norm; collective.
 
     In a space of functions that are constant on cells it has the mean of the value on each.
 
@@ -55,13 +59,15 @@ def project(value: ValueOrExpression, V: FunctionSpace | CellwiseSpace) -> Funct
         load, scalar = _load_at_points(value, V), FunctionSpace(V.hierarchy)
     else:
         load, scalar = _load(_as_ufl(value, V), V), FunctionSpace(V.hierarchy, (), V.integration)
-    _check_finite(load)
+    owned = load[: V.index_map.size_local]
+    together(V.mesh.comm, lambda: _check_finite(owned))
     mass = assemble_matrix(
         form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
     )
+    found = conjugate_gradients(product(mass, V.index_map), mass.diagonal(), owned, V.mesh.comm)
     result = Function(V)
-    components = [conjugate_gradients(mass, b, TOLERANCE) for b in load.T]
-    result.x.array = np.stack(components, axis=1).ravel()
+    result.x.array[: V.num_owned_dofs] = found.ravel()
+    result.x.scatter_forward()
     return result
 
 
@@ -72,6 +78,9 @@ class Projection:
     the source, P^T G P x = P^T G Q u. Constants lie in all three spaces, so that either norm keeps the integral of u
     (over these cells). What the solver leaves of the residual against constants, a constant takes away.
 
+    Making one is collective, and so is its use. On several ranks, which have different parts of the three spaces,
+    P^T G P is not made but applied.
+
     Args:
         common: Scalar space that refines both.
         source: Where functions are.
@@ -81,20 +90,45 @@ class Projection:
 
     def __init__(self, common: FunctionSpace, source: Hierarchy, target: Hierarchy, norm: Norm):
         trial, test = ufl.TrialFunction(common), ufl.TestFunction(common)
-        product = ufl.inner(trial, test)
+        inner = ufl.inner(trial, test)
         if norm == "H1":
-            product += ufl.inner(ufl.grad(trial), ufl.grad(test))
-        G = assemble_matrix(form(product * ufl.dx, quadrature_degree=DEGREE))
-        P, self._from_source = (common.hierarchy.prolongation(hierarchy) for hierarchy in (target, source))
-        self._to_target = sp.csr_array(P.T @ G)
-        self._matrix = sp.csr_array(self._to_target @ P)
-        self._solve = solver(self._matrix, TOLERANCE)
+            inner += ufl.inner(ufl.grad(trial), ufl.grad(test))
+        self._comm, self._functions = common.mesh.comm, FunctionSpace(target).index_map
+        self._gram = assemble_matrix(form(inner * ufl.dx, quadrature_degree=DEGREE))
+        self._from_target, self._from_source = (Prolongation(common.hierarchy, coarse) for coarse in (target, source))
+        self._solve = self._factorised() if self._functions.is_whole else self._iterated(self._diagonal())
+        self._area = total(self._comm, self._applied(np.ones((self._functions.numbers.size, 1))).sum())
 
     def __call__(self, values: Floats) -> Floats:
-        """Return the coefficients of the projections of functions, one in each column."""
-        load = self._to_target @ (self._from_source @ values)
+        """Return the coefficients of the projections of functions, one in each column, shape (local, k), collective."""
+        load = self._tested(self._from_source(values))
         x = self._solve(load)
-        return x + (load - self._matrix @ x).sum(axis=0) / self._matrix.sum()
+        x += total(self._comm, (load - self._applied(x)).sum(axis=0)) / self._area
+        result = np.zeros((self._functions.numbers.size, x.shape[1]))
+        result[: len(x)] = x
+        self._functions.scatter_forward(result)
+        return result
+
+    def _tested(self, values: Floats) -> Floats:
+        """Return the inner products of functions in the common space with those that this rank owns of the target."""
+        return self._from_target.transposed(self._gram @ values)[: self._functions.size_local]
+
+    def _applied(self, x: Floats) -> Floats:
+        """Return P^T G P x, owned parts both."""
+        return self._tested(self._from_target(x))
+
+    def _factorised(self) -> Callable[[Floats], Floats]:
+        P = self._from_target.matrix
+        return solver(sp.csr_array(sp.csr_array(P.T @ self._gram) @ P), TOLERANCE)
+
+    def _iterated(self, diagonal: Floats) -> Callable[[Floats], Floats]:
+        return lambda load: conjugate_gradients(self._applied, diagonal, load, self._comm)
+
+    def _diagonal(self) -> Floats:
+        """Return the diagonal of P^T G P, owned part."""
+        P = self._from_target.matrix
+        entries = P[: self._gram.shape[0]] * (self._gram @ P)
+        return self._from_target.gathered(entries.sum(axis=0))[: self._functions.size_local]
 
 
 # The last projection from each hierarchy, for as long as that lives: several functions are carried over at once, but
@@ -103,7 +137,7 @@ _last: WeakKeyDictionary[Hierarchy, tuple[ref[Hierarchy], Rule, Norm, Projection
 
 
 def projector(source: Hierarchy, V: FunctionSpace, norm: Norm) -> Projection:
-    """Return the projection from a hierarchy to that of V; the same one if asked for again.
+    """Return the projection from a hierarchy to that of V; the same one if asked for again. Collective.
 
     Args:
         source: Where functions are.
@@ -150,9 +184,9 @@ def _as_constant(value: object, V: FunctionSpace | CellwiseSpace) -> Constant:
 
 
 def _load(value: ufl.core.expr.Expr, V: FunctionSpace) -> Floats:
-    """Return the integrals of the value times each function, shape (num_functions, block_size)."""
+    """Return the integrals of the value times each function, shape (local, block_size), right where owned."""
     if isinstance(value, ufl.classes.Zero):
-        return np.zeros((V.num_functions, V.block_size))
+        return np.zeros((V.index_map.numbers.size, V.block_size))
     L = form(ufl.inner(value, ufl.TestFunction(V)) * ufl.dx, quadrature_degree=DEGREE)
     return assemble_vector(L).reshape(-1, V.block_size)
 
@@ -166,7 +200,7 @@ def _load_at_points(value: ValueOrExpression, V: FunctionSpace) -> Floats:
 
 
 def _quadrature(cells: Cells) -> tuple[Ints, Floats, Floats]:
-    """Return all pieces, the points of the rule, shape (q, 2), and the area that each stands for, (num_pieces, q)."""
+    """Return all local pieces, the points of the rule, shape (q, 2), and the area that each stands for, (pieces, q)."""
     pieces = np.arange(cells.num_pieces, dtype=np.int32)
     points, weights = (np.asarray(a) for a in basix.make_quadrature(basix.CellType.quadrilateral, DEGREE))
     return pieces, points, cells.area_element(pieces, points) * weights
@@ -174,10 +208,12 @@ def _quadrature(cells: Cells) -> tuple[Ints, Floats, Floats]:
 
 def _cell_means(value: ValueOrExpression, V: CellwiseSpace) -> Function:
     if callable(value) and not isinstance(value, ufl.core.expr.Expr):
-        pieces, points, areas = _quadrature(V.cells)
-        values = values_at(value, FunctionSpace(V.cells.hierarchy), pieces, points, V.block_size)
+        cells = V.cells
+        pieces, points, areas = _quadrature(cells)
+        values = values_at(value, FunctionSpace(cells.hierarchy), pieces, points, V.block_size)
         integrals = np.einsum("pqc,pq->cp", values, areas)
-        means = [_means(V, V.cells, V.cells.piece_cell, component) for component in integrals]
+        of_cells = [np.bincount(cells.piece_cell, weights=w, minlength=cells.num_cells) for w in integrals]
+        means = [_means(V, cells, component[: cells.num_owned]) for component in of_cells]
     else:
         means = [_mean(density, V) for density in _components(_as_ufl(value, V))]
     result = Function(V)
@@ -192,19 +228,21 @@ def _components(value: ufl.core.expr.Expr) -> list[ufl.core.expr.Expr]:
 def _mean(density: ufl.core.expr.Expr, V: CellwiseSpace) -> Floats:
     """Return the mean of a scalar on each face or cell, integrated on the cells of the finest function in it."""
     if isinstance(density, ufl.classes.Zero):
-        return np.zeros(V.num_cells)
+        return np.zeros(V.index_map.numbers.size)
     on = None if V.hierarchy is None else FunctionSpace(V.hierarchy)
     compiled = form(density * ufl.dx(domain=V.mesh.ufl_domain()), quadrature_degree=DEGREE, on=on)
-    return _means(V, compiled.cells, np.arange(compiled.cells.num_cells), assemble_cells(compiled))
+    return _means(V, compiled.cells, assemble_cells(compiled))
 
 
-def _means(V: CellwiseSpace, cells: Cells, of_cells: npt.NDArray[np.integer], integrals: Floats) -> Floats:
-    """Return sums of integrals over given cells, or parts of them, divided by the area of the face or cell of V."""
-    _check_finite(integrals)
-    number = V.numbers_of(cells)
-    areas = _quadrature(cells)[2].sum(axis=1)
-    sums, area = (
-        np.bincount(number[part], weights=weights, minlength=V.num_cells)
-        for part, weights in ((of_cells, integrals), (cells.piece_cell, areas))
-    )
-    return sums / area
+def _means(V: CellwiseSpace, cells: Cells, integrals: Floats) -> Floats:
+    """Return sums of integrals over cells, shape (cells.num_owned,), divided by the area of the face or cell of V."""
+    comm, own = V.mesh.comm, cells.num_owned
+    together(comm, lambda: _check_finite(integrals))
+    numbers = together(comm, lambda: V.numbers_of(cells))[:own]
+    areas = np.bincount(cells.piece_cell, weights=_quadrature(cells)[2].sum(axis=1), minlength=own)[:own]
+    sums = np.zeros((V.index_map.numbers.size, 2))
+    Fetch(V.index_map, numbers).add_back(np.stack([integrals, areas], axis=1), sums)
+    if V.hierarchy is None:  # all ranks hold all faces, and cells of some
+        sums = total(comm, sums)
+    V.index_map.scatter_forward(sums)
+    return np.asarray(sums[:, 0] / sums[:, 1])

@@ -25,7 +25,6 @@ from thccs_fem.folds import check_no_folds
 from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
 from thccs_fem.index_map import IndexMap
 from thccs_fem.mesh import ControlMesh
-from thccs_fem.parallel import together
 from thccs_fem.partition import partition
 from thccs_fem.subdivision import Ints
 
@@ -66,6 +65,7 @@ class FunctionSpace(ufl.FunctionSpace):
         self.hierarchy = hierarchy
         self.integration = integration
         self.block_size = int(np.prod(value_shape, dtype=int))
+        partition(hierarchy)  # on all ranks together, as spaces are made: then one rank may ask for sizes
 
     dofmap = Absent("V.cells.batches have the dofs of cells; their number is V.num_dofs, the block size V.block_size")
     tabulate_dof_coordinates = Absent("coefficients belong to no points; V.reference_points has one near each function")
@@ -177,6 +177,9 @@ class FunctionSpace(ufl.FunctionSpace):
 
     def prolongation(self, coarse: FunctionSpace) -> sp.csr_array:
         """Return the exact transfer from a coarser space, shape (num_dofs, coarse.num_dofs).
+
+        On several ranks it is the same on each, for the dofs of all of them by their numbers in the hierarchies, not for
+        local ones: `adapt.transfer` carries functions over.
 
         Raises:
             ValueError: If the spaces are not nested or their values have different shapes.
@@ -394,7 +397,7 @@ def functionspace(
         return CellwiseSpace(mesh, value_shape=value_shape)
     hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level)
     space = FunctionSpace(hierarchy, value_shape)
-    together(mesh.comm, lambda: check_no_folds(space.cells))
+    check_no_folds(space.cells)
     return space
 
 

@@ -115,7 +115,7 @@ class EigenProblem:
         system, solver = self._system, self._solver
         system.bcs = self.bcs
         system.assemble()
-        A, M = (sharing(matrix, self._comm) for matrix in (system.A, system.M))
+        A, M = (sharing(matrix, self._comm, system.numbering) for matrix in (system.A, system.M))
         with self._options.in_place():
             solver.reset()  # the size may be another one
             solver.setOperators(A, M)
@@ -141,7 +141,7 @@ class EigenProblem:
         trial.setOptionsPrefix(pc.getOptionsPrefix())
         try:
             trial.setUp()
-            check_regular(shifted, lambda r: solved(trial.getFactorMatrix(), r))
+            check_regular(shifted, lambda r: solved(trial.getFactorMatrix(), r), system.a.spaces[1].mesh.comm)
         except RuntimeError:  # ours, or PETSc's own, if there are no factors
             return system.shift_beside()
         return system.target
@@ -156,7 +156,7 @@ class EigenProblem:
         pc = PETSc.PC().create(self._comm)
         pc.setType(kind)
         pc.setFactorSolverType(solver)
-        pc.setOperators(sharing(A, self._comm))
+        pc.setOperators(sharing(A, self._comm, self._system.numbering))
         return pc
 
     def _count(self, number: float) -> int:
@@ -181,7 +181,7 @@ class EigenProblem:
 
     def _converged(self) -> tuple[Floats, Floats]:
         """Return the eigenvalues that converged, and their vectors as columns."""
-        solver, n = self._solver, self._system.A.shape[0]
+        solver, n = self._solver, self._system.num_owned
         count = solver.getConverged()
         vectors = np.zeros((count, n))
         values = np.array([solver.getEigenpair(i, new_vec(row, self._comm)) for i, row in enumerate(vectors)])

@@ -19,9 +19,11 @@ from thccs_fem.fem import assembly
 from thccs_fem.fem.bcs import DirichletBC
 from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
+from thccs_fem.fem.layout import Layout
 from thccs_fem.fem.linear import constrain, constraints
 from thccs_fem.fem.petsc.matrices import changed, new_mat
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import total
 from thccs_fem.subdivision import Ints
 from ufl.algorithms import expand_derivatives
 
@@ -42,6 +44,7 @@ class EvolutionEquations:
         bcs: As for `TimeProblem`.
 
     Attributes:
+        layout: The dofs.
         derivative: The compiled derivative of F, with udot changing faster than u by a constant.
         A: Its matrix, as last assembled.
     """
@@ -50,6 +53,7 @@ class EvolutionEquations:
         V = u.function_space
         self._F, self._test = F, _test_function(F, u, udot)
         self.u, self.udot, self.t, self.bcs = u, udot, t, bcs
+        self.layout = Layout((V,))
         self._form = form(F)
         self._shift = Constant(V.mesh, 1.0)
         with_degrees, trial = self._form.ufl_form, ufl.TrialFunction(V)  # the same quadrature for the derivative
@@ -81,16 +85,17 @@ class EvolutionEquations:
             )
 
     def with_prescribed(self, values: Floats, time: float) -> Floats:
-        """Return values of u, with those in place that are prescribed at a time."""
+        """Return values of u, of the dofs that this rank owns, with those in place that are prescribed at a time."""
         dofs, prescribed = self._conditions(time)
+        owned = np.searchsorted(dofs, values.size)
         values = values.copy()
-        values[dofs] = prescribed
+        values[dofs[:owned]] = prescribed[:owned]
         return values
 
     def accept(self, time: float, values: Floats) -> None:
-        """Give u its values at a time."""
+        """Give u its values at a time; collective."""
         self.t.value = time
-        self.u.x.array = values
+        self.layout.spread(values, [self.u])
 
     def residual(self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, F: PETSc.Vec) -> None:
         """Evaluate F; for prescribed dofs u minus what is prescribed."""
@@ -98,7 +103,7 @@ class EvolutionEquations:
         values = assembly.assemble_vector(self._form)
         dofs, prescribed = self._conditions(t)
         values[dofs] = self.u.x.array[dofs] - prescribed
-        F.array = values
+        F.array = values[: self.layout.num_owned]
 
     def jacobian(
         self, ts: PETSc.TS, t: float, u: PETSc.Vec, udot: PETSc.Vec, shift: float, J: PETSc.Mat, P: PETSc.Mat
@@ -108,7 +113,8 @@ class EvolutionEquations:
         self._shift.value = shift
         dofs, _ = self._conditions(t)
         at = [f.x.array for f in self.derivative.coefficients] + [c.value for c in self.derivative.constants] + [dofs]
-        if len(at) != len(self._at) or not all(map(np.array_equal, at, self._at)):
+        is_same = len(at) == len(self._at) and all(map(np.array_equal, at, self._at))
+        if total(self.layout.comm, int(not is_same)):
             self._at = [values.copy() for values in at]
             assembly.assemble_matrix(self._values, self.derivative)
             constrain(self._values, dofs, columns=False)
@@ -120,7 +126,7 @@ class EvolutionEquations:
 
     def _set(self, t: float, u: PETSc.Vec, udot: PETSc.Vec) -> None:
         self.accept(t, values_of(u))
-        self.udot.x.array = values_of(udot)
+        self.layout.spread(values_of(udot), [self.udot])
 
     def _conditions(self, time: float) -> tuple[Ints, Floats]:
         """Return the prescribed dofs and values at a time, which need not be found twice."""
@@ -132,7 +138,7 @@ class EvolutionEquations:
 
 
 def values_of(x: PETSc.Vec) -> Floats:
-    """Return the values of a vector, not to be changed."""
+    """Return the values of a vector, those that this rank owns, not to be changed."""
     values: Any = x.array_r  # float64, which new_mat has checked
     return values
 

@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
-from thccs_fem.fem.blocks import BlockMatrix, Conditions, Layout
+from thccs_fem.fem.blocks import BlockMatrix
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Conditions, Layout
 from thccs_fem.fem.linear import (
     Constants,
     LinearSystem,
@@ -172,7 +173,7 @@ class LinearProblem:
         """Choose a solver unless the user did so, read options, and say which dofs belong together."""
         spaces = self._system.layout.spaces
         if not self._is_chosen:
-            symmetric = is_symmetric(self._system.A, self._system.layout)
+            symmetric = is_symmetric(self._system.A, self._system.layout.numbering)
             V = spaces[0] if symmetric and len(spaces) == 1 else None
             choose(self._solver, self.A, symmetric, is_fourth_order(self._system.a), V)
             self._solver.setFromOptions()

@@ -19,10 +19,13 @@ import scipy.sparse as sp
 
 from thccs_fem.fem import assembly
 from thccs_fem.fem.bcs import DirichletBC
-from thccs_fem.fem.blocks import BlockMatrix, Layout, constraints
+from thccs_fem.fem.blocks import BlockMatrix
+from thccs_fem.fem.entries import Numbering
 from thccs_fem.fem.forms import Form
+from thccs_fem.fem.layout import Layout, constraints
 from thccs_fem.fem.linear import constrain
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import total
 from thccs_fem.subdivision import Ints
 
@@ -64,9 +67,10 @@ def assemble_matrix(form: Any, *args: Any, **kwargs: Any) -> PETSc.Mat:
 
 @assemble_matrix.register
 def _(form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
-    A = assembly.assemble_matrix(form)
+    columns = _columns(form)
+    A = assembly.assemble_block(form, columns)
     _constrain(A, form, bcs)
-    return new_mat(A, form.spaces)
+    return new_mat(A, form.spaces, columns)
 
 
 @assemble_matrix.register
@@ -74,7 +78,7 @@ def _(A: PETSc.Mat, form: Form, bcs: Sequence[DirichletBC] = ()) -> PETSc.Mat:
     values = A.getAttr("values")
     if not isinstance(values, sp.csr_array):
         raise ValueError("the matrix to be filled does not use memory of ours: make it with assemble_matrix(form)")
-    assembly.assemble_matrix(values, form)
+    assembly.refill_block(values, form, _columns(form))
     _constrain(values, form, bcs)
     changed(A)
     return A
@@ -124,12 +128,14 @@ def apply_lifting(
     """
     states = [x.array_r for x in x0] or [np.zeros(form.spaces[1].num_owned_dofs) for form in a]
     for form, conditions, state in zip(a, bcs, states, strict=True):
-        V = form.spaces[1]
+        V, columns = form.spaces[1], _columns(form)
         dofs, values = constraints(conditions, V)
         if total(V.mesh.comm, dofs.size):
-            jump = np.zeros(V.num_local_dofs)
-            jump[dofs] = values - Layout((V,)).with_ghosts(np.asarray(state, dtype=np.float64))[dofs]
-            b.array_w[:] -= alpha * (assembly.assemble_matrix(form) @ jump)
+            owned = np.searchsorted(dofs, V.num_owned_dofs)
+            jump = np.zeros((columns.numbers.size, V.block_size))
+            jump.ravel()[dofs[:owned]] = values[:owned] - state[dofs[:owned]]
+            columns.scatter_forward(jump)
+            b.array_w[:] -= alpha * (assembly.assemble_block(form, columns) @ jump.ravel())
     return b
 
 
@@ -147,6 +153,11 @@ def set_bc(b: PETSc.Vec, bcs: Sequence[DirichletBC], x0: PETSc.Vec | None = None
         owned = np.searchsorted(dofs, b.getLocalSize())
         dofs, values = dofs[:owned], values[:owned]
         b.array_w[dofs] = alpha * (values if x0 is None else values - x0.array_r[dofs])
+
+
+def _columns(form: Form) -> IndexMap:
+    """Return the trial functions of a matrix."""
+    return Layout(form.spaces).index_maps[-1]
 
 
 def _constrain(A: sp.csr_array, form: Form, bcs: Sequence[DirichletBC]) -> None:
@@ -178,15 +189,16 @@ def new_ghosted_vec(array: Floats, V: FunctionSpace) -> PETSc.Vec:
     return PETSc.Vec().createGhostWithArray(ghosts, values, size=size, bsize=V.block_size, comm=comm_of(V))
 
 
-def new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace]) -> PETSc.Mat:
+def new_mat(A: sp.csr_array, spaces: Sequence[FunctionSpace], columns: IndexMap | None = None) -> PETSc.Mat:
     """Return a matrix that uses the memory of A.
 
     Args:
-        A: The values, as `assembly.assemble_matrix` returns them.
+        A: The values, as `assembly.assemble_block` returns them.
         spaces: Spaces of rows and columns.
+        columns: The functions that are columns; None: those that this rank holds in their space.
     """
     test, trial = spaces
-    mat = sharing(A, comm_of(test), None if test.index_map.is_whole else Layout((trial,)).global_numbers)
+    mat = sharing(A, comm_of(test), Numbering.of(trial.index_map if columns is None else columns, trial.block_size))
     mat.setBlockSizes(test.block_size, trial.block_size)
     return mat
 
@@ -206,12 +218,15 @@ def new_block_mat(A: BlockMatrix | sp.csr_array, layout: Layout, kind: str = "mp
     if kind == "mpi":
         if len(spaces) == 1:
             return new_mat(whole, (spaces[0], spaces[0]))
-        return sharing(whole, comm_of(spaces[0]), None if layout.is_whole else layout.global_numbers)
+        return sharing(whole, comm_of(spaces[0]), layout.numbering)
     if kind != "nest" or not isinstance(A, BlockMatrix) or len(spaces) == 1:
         raise ValueError(f'kind is {kind!r}; it must be "mpi", or "nest" for several unknowns')
     A.scatter()
     mats: Any = [  # None where there is no block, other than the stubs say
-        [None if block is None else new_mat(block, (test, trial)) for block, trial in zip(row, spaces, strict=True)]
+        [
+            None if block is None else new_mat(block, (test, trial), columns)
+            for block, trial, columns in zip(row, spaces, layout.index_maps, strict=True)
+        ]
         for row, test in zip(A.blocks, spaces, strict=True)
     ]
     nest = PETSc.Mat().createNest(mats, comm=comm_of(spaces[0]))
@@ -220,18 +235,16 @@ def new_block_mat(A: BlockMatrix | sp.csr_array, layout: Layout, kind: str = "mp
     return nest
 
 
-def sharing(A: sp.csr_array, comm: Any, columns: Ints | None = None, num_owned: int | None = None) -> PETSc.Mat:
+def sharing(A: sp.csr_array, comm: Any, columns: Numbering | None = None) -> PETSc.Mat:
     """Return a matrix that uses the memory of A, of whatever dofs.
 
     On several ranks it uses memory of its own, for entries in columns that this rank owns and for the others; `changed`
     fills it with what is in A.
 
     Args:
-        A: The values, on several ranks a row for each dof that this rank owns, columns sorted.
+        A: The values, on several ranks a row for each dof that this rank owns, and columns for its ghosts, too.
         comm: Communicator.
-        columns: On several ranks PETSc's number of each column of A, owned ones first, the others ascending; None in
-            serial.
-        num_owned: How many columns this rank owns; None: as many as rows.
+        columns: What PETSc calls the columns; None in serial.
     """
     if np.dtype(PETSc.ScalarType) != np.float64:
         raise TypeError(
@@ -241,15 +254,14 @@ def sharing(A: sp.csr_array, comm: Any, columns: Ints | None = None, num_owned: 
         mat = PETSc.Mat().createAIJWithArrays(A.shape, _csr(A.indptr, A.indices, A.data), comm=comm)
         mat.setAttr("values", A)
         return mat
-    num_owned = A.shape[0] if num_owned is None else num_owned
-    is_own = A.indices < num_owned
+    is_own = A.indices < columns.num_owned
     before = np.concatenate([[0], np.cumsum(is_own, dtype=np.int32)])[A.indptr]
     own = _csr(before, A.indices[is_own], A.data[is_own])
-    others = _csr(A.indptr - before, columns[A.indices[~is_own]], A.data[~is_own])
-    size: Any = (A.shape[0], None), (num_owned, None)  # None: whatever it is, other than the stubs say
+    others = _csr(A.indptr - before, columns.numbers[A.indices[~is_own]], A.data[~is_own])
+    size: Any = (A.shape[0], None), (columns.num_owned, None)  # None: whatever it is, other than the stubs say
     mat = PETSc.Mat().createAIJWithArrays(size, (own, others), comm=comm)
     mat.setAttr("values", A)
-    mat.setAttr("parts", (num_owned, own[2], others[2]))
+    mat.setAttr("parts", (columns.num_owned, own[2], others[2]))
     return mat
 
 

@@ -14,10 +14,10 @@ import numpy.typing as npt
 
 import ufl
 from thccs_fem.fem import nonlinear
-from thccs_fem.fem.blocks import Conditions
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.linear import check_regular, is_fourth_order
+from thccs_fem.fem.layout import Conditions
+from thccs_fem.fem.linear import check_regular, is_finite, is_fourth_order
 from thccs_fem.fem.nonlinear import MAX_ITERATIONS, RELATIVE, STEP, NonlinearSystem
 from thccs_fem.fem.petsc import linear
 from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec
@@ -93,7 +93,7 @@ class NonlinearProblem:
         self._kind = kind
         layout = self._system.layout
         self._comm = comm_of(layout.spaces[0])
-        self._b = np.zeros(layout.num_dofs)
+        self._b = np.zeros(layout.num_owned)
         self._solver = PETSc.SNES().create(self._comm)
         self._solver.setOptionsPrefix(petsc_options_prefix)
         self._solver.setTolerances(rtol=RELATIVE, stol=STEP, max_it=MAX_ITERATIONS)
@@ -176,7 +176,7 @@ class NonlinearProblem:
         solver = self._solver
         reason: Any = solver.getConvergedReason()  # an int, other than the stubs say
         name = REASONS.get(reason, str(reason))
-        if reason > 0 and np.isfinite(x).all():
+        if reason > 0 and is_finite(self._system.layout.comm, x):
             return
         if name == "DIVERGED_LINE_SEARCH" and self._system.is_rounding(x, self._system.residual(x)):
             return  # nothing can lower it
@@ -201,7 +201,8 @@ class NonlinearProblem:
         """Return what to say if the last Jacobian that was factorised is singular, which MUMPS seldom notices."""
         factors = self._solver.getKSP().getPC()
         try:
-            check_regular(self._system.regular(), lambda r: linear.solved(factors.getFactorMatrix(), r))
+            solve = partial(linear.solved, factors.getFactorMatrix())
+            check_regular(self._system.regular(), solve, self._system.layout.comm)
         except PETSc.Error:  # there are no factors
             return ""
         except RuntimeError as error:

@@ -20,13 +20,14 @@ import numpy.typing as npt
 
 import ufl
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.linear import is_fourth_order
+from thccs_fem.fem.linear import is_finite, is_fourth_order
 from thccs_fem.fem.nonlinear import RELATIVE
 from thccs_fem.fem.petsc import linear, nonlinear
 from thccs_fem.fem.petsc.evolution import Conditions, EvolutionEquations, values_of
 from thccs_fem.fem.petsc.matrices import comm_of, new_vec
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import total
 
 __all__ = ["TimeProblem"]
 
@@ -63,6 +64,7 @@ class TimeProblem:
         t: The time in F, with its value at the start; None: it is not in F, and starts at 0.
         bcs: Conditions; where they change, a function ``bcs(V, time)`` that returns them, called with `t` set to that
             time. Prescribed values replace those of u at the start, and where the space changes.
+        before: `before` of another problem that this one shall go on from, after a checkpoint, say; None: a new start.
         petsc_options_prefix: What distinguishes the options of this problem, usually with "_" at the end.
         petsc_options: Options without the prefix, as ``{"snes_rtol": 1e-12}``. They hold for this problem, and before
             those on the command line.
@@ -70,8 +72,8 @@ class TimeProblem:
     Raises:
         TypeError: F is no form, or a condition none.
         ValueError: F has not one test function, in the space of u and udot, or no udot; a condition is in another
-            space; dt is not positive; the scheme is unknown, or "crank_nicolson" where the terms with udot have u, udot
-            or t in other factors; or the prefix is empty.
+            space, or `before` is; dt is not positive; the scheme is unknown, or "crank_nicolson" where the terms with
+            udot have u, udot or t in other factors; or the prefix is empty.
     """
 
     def __init__(
@@ -84,6 +86,7 @@ class TimeProblem:
         scheme: Scheme = "bdf2",
         t: Constant | None = None,
         bcs: Conditions = (),
+        before: tuple[float, Function] | None = None,
         petsc_options_prefix: str,
         petsc_options: Mapping[str, Any] | None = None,
     ):
@@ -99,7 +102,14 @@ class TimeProblem:
             self._equations.check_constant_mass()
         self._scheme: Scheme = scheme
         self._before: tuple[float, Floats] | None = None  # time and values before the last step
-        self._ts = self._stepper(float(t), 0, _checked(dt))
+        if before is not None:
+            if before[1].function_space != u.function_space:
+                raise ValueError(
+                    f"the values before are in {before[1].function_space}; they must be in the space of the unknown, "
+                    f"{u.function_space}"
+                )
+            self._before = before[0], self._equations.layout.join([before[1]])
+        self._ts = self._stepper(float(t), int(before is not None), _checked(dt))
 
     @property
     def u(self) -> Function:
@@ -110,6 +120,18 @@ class TimeProblem:
     def udot(self) -> Function:
         """What stands for the derivative of u, with the values at which F was last evaluated."""
         return self._equations.udot
+
+    @property
+    def before(self) -> tuple[float, Function] | None:
+        """Time and solution before the last step; None at the start.
+
+        With it and `u` "bdf2" goes on in another run as in this one; the other schemes need u alone.
+        """
+        if self._before is None:
+            return None
+        u = Function(self.u.function_space, name=f"{self.u.name} before")
+        self._equations.layout.spread(self._before[1], [u])
+        return self._before[0], u
 
     @property
     def time(self) -> float:
@@ -142,18 +164,19 @@ class TimeProblem:
             RuntimeError: A solver fails; the message has the reasons of TS, SNES and KSP. Time and u are those before
                 the step, which may be tried again with a smaller `dt`.
         """
-        ts, x = self._ts, self._ts.getSolution()
-        if not np.array_equal(self.u.x.array, values_of(x)):  # changed from outside: what was before is no history
+        ts, x, present = self._ts, self._ts.getSolution(), self._present
+        is_changed = not np.array_equal(present, values_of(x))
+        if total(self._comm, int(is_changed)):  # from outside: what was before is no history
             self._before = None
             ts.restartStep()
         if self._before is None:
-            x.array = self._equations.with_prescribed(self.u.x.array, self.time)
+            x.array = self._equations.with_prescribed(present, self.time)
         number, dt, before = self.step_number, self.dt, (self.time, values_of(x).copy())
         try:
             with self._options.in_place():
                 ts.step()
             reason: Any = ts.getConvergedReason()  # an int, other than the stubs say
-            if reason < 0 or not np.isfinite(values_of(x)).all():
+            if reason < 0 or not is_finite(self._comm, values_of(x)):
                 where = f"in the step from t = {before[0]:g} with dt = {dt:g}"
                 raise RuntimeError(f"PETSc's {ts.getType()} failed {where}: {_why(ts)}")
         except Exception as error:
@@ -230,11 +253,21 @@ class TimeProblem:
         problem._options = self._options
         if self._before is not None:
             time, before = self._before[0], self.u.copy()
-            before.x.array = self._before[1]
-            problem._before = time, problem._equations.with_prescribed(transfer(before, V).x.array, time)
-        problem._equations.accept(self.time, problem._equations.with_prescribed(problem.u.x.array, self.time))
+            equations.layout.spread(self._before[1], [before])
+            carried = problem._equations.layout.join([transfer(before, V)])
+            problem._before = time, problem._equations.with_prescribed(carried, time)
+        problem._equations.accept(self.time, problem._equations.with_prescribed(problem._present, self.time))
         problem._ts = problem._stepper(self.time, self.step_number, self.dt)
         return problem
+
+    @property
+    def _comm(self) -> Any:
+        return self._equations.layout.comm
+
+    @property
+    def _present(self) -> Floats:
+        """The values of u that this rank owns, a new array."""
+        return self._equations.layout.join([self.u])
 
     # ---- The TS
 
@@ -245,7 +278,7 @@ class TimeProblem:
         ts.setType(TYPES[self._scheme])
         ts.setErrorIfStepFails(False)
         ts.setMaxSteps(UNLIMITED)
-        ts.setSolution(new_vec(self.u.x.array.copy(), ts.comm))
+        ts.setSolution(new_vec(self._present, ts.comm))
         equations = proxy(self._equations)  # which a TS must not own: when Python ends, it cannot take them back
         ts.setIJacobian(partial(EvolutionEquations.jacobian, equations), self._equations.A)
         snes = ts.getSNES()
@@ -255,9 +288,7 @@ class TimeProblem:
             linear.choose(snes.getKSP(), self._equations.A, False, is_fourth_order([[self._equations.derivative]]))
         if self._before is not None and self._scheme == "bdf2":
             self._replay(ts, time, number)
-        ts.setIFunction(
-            partial(EvolutionEquations.residual, equations), new_vec(np.zeros_like(self.u.x.array), ts.comm)
-        )
+        ts.setIFunction(partial(EvolutionEquations.residual, equations), new_vec(np.zeros_like(self._present), ts.comm))
         with self._options.in_place():
             ts.setFromOptions()
         linear.set_levels(snes.getKSP(), [self.u.function_space])
@@ -278,7 +309,7 @@ class TimeProblem:
         ts.setTimeStep(time - self._before[0])
         x.array = self._before[1]
         ts.step()
-        x.array = self.u.x.array
+        x.array = self._present
 
 
 def _checked(dt: float) -> float:

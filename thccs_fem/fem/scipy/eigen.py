@@ -14,7 +14,7 @@ from thccs_fem.fem.bcs import DirichletBC
 from thccs_fem.fem.eigen import EigenSystem
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.scipy.linear import factorised, num_negative
+from thccs_fem.fem.scipy.linear import check_serial, factorised, num_negative
 
 __all__ = ["EigenProblem"]
 
@@ -47,6 +47,7 @@ class EigenProblem:
         TypeError: A form is no form, or a condition none.
         ValueError: The forms are not bilinear forms on one space, a condition is in another one, or no eigenvalue is
             wanted.
+        NotImplementedError: The mesh is on several ranks.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class EigenProblem:
         petsc_options: Mapping[str, Any] | None = None,
     ):
         self._system = EigenSystem(a, m, bcs=bcs, num_eigenvalues=num_eigenvalues, target=target)
+        check_serial(self._system.a.spaces[1].mesh.comm, "EigenProblem")
         self.bcs = bcs
 
     def solve(self) -> tuple[Floats, list[Function]]:

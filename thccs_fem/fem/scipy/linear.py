@@ -2,7 +2,7 @@
 
 Matrices with up to `LARGEST_DIRECT` entries, and all that are not symmetric, are factorised by SuperLU; for larger
 ones there are conjugate gradients with Jacobi's preconditioner, which do for second-order problems.
-`thccs_fem.fem.petsc` has more to choose from.
+`thccs_fem.fem.petsc` has more to choose from, and works on several ranks.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 import ufl
-from thccs_fem.fem.blocks import Conditions
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Conditions
 from thccs_fem.fem.linear import LinearSystem, check_regular, check_residual, is_symmetric
+from thccs_fem.parallel import size_of
 
-__all__ = ["LinearProblem", "conjugate_gradients", "factorised", "num_negative", "solve", "solver"]
+__all__ = ["LinearProblem", "check_serial", "conjugate_gradients", "factorised", "num_negative", "solve", "solver"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -56,6 +57,7 @@ class LinearProblem:
     Raises:
         TypeError: A form is no form, or a condition none.
         ValueError: The forms have not the arguments of an equation, or u or a condition is in another space.
+        NotImplementedError: The mesh is on several ranks.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class LinearProblem:
         kind: str = "mpi",
     ):
         self._system = LinearSystem(a, L, bcs=bcs, u=u, load=load)
+        check_serial(self._system.layout.comm, "LinearProblem")
         self.bcs = bcs
         self.load = load
 
@@ -102,6 +105,23 @@ class LinearProblem:
         self._system.bcs, self._system.load = self.bcs, self.load
         self._system.assemble()
         return self._system.accept(solve(self._system.regular(), self._system.b))
+
+
+def check_serial(comm: Any, problem: str) -> None:
+    """Raise if there are several ranks.
+
+    Args:
+        comm: Communicator, or None.
+        problem: Class of the problem.
+
+    Raises:
+        NotImplementedError: There are.
+    """
+    if size_of(comm) > 1:
+        raise NotImplementedError(
+            f"fem.scipy.{problem} works in one process, but the mesh is on {size_of(comm)} ranks: "
+            f"use fem.petsc.{problem}, which takes the same arguments and a petsc_options_prefix"
+        )
 
 
 def solve(A: sp.csr_array, b: Floats) -> Floats:

@@ -10,11 +10,11 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 import ufl
-from thccs_fem.fem.blocks import Conditions
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
+from thccs_fem.fem.layout import Conditions
 from thccs_fem.fem.nonlinear import MAX_ITERATIONS, RELATIVE, STEP, NonlinearSystem, failure
-from thccs_fem.fem.scipy.linear import solve
+from thccs_fem.fem.scipy.linear import check_serial, solve
 
 __all__ = ["NonlinearProblem"]
 
@@ -56,6 +56,7 @@ class NonlinearProblem:
     Raises:
         TypeError: A form is no form, u is no function, or a condition none.
         ValueError: The forms have not the arguments of an equation, or u or a condition is in another space.
+        NotImplementedError: The mesh is on several ranks.
     """
 
     def __init__(
@@ -70,8 +71,9 @@ class NonlinearProblem:
         kind: str = "mpi",
     ):
         self._system = NonlinearSystem(F, u, bcs=bcs, J=J)
+        check_serial(self._system.layout.comm, "NonlinearProblem")
         self.bcs = bcs
-        self.b = np.zeros(self._system.layout.num_dofs)
+        self.b = np.zeros(self._system.layout.num_owned)
         self.norms: list[float] = []
 
     @property

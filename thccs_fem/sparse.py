@@ -1,0 +1,113 @@
+"""Sparse matrices from triplets, products and rows, by the loops of kernels.c.
+
+What SciPy does too, at a tenth of its overhead: a level of a hierarchy needs some thirty of these, mostly small, and
+SciPy looks through all indices of every matrix that it makes.  Results are SciPy's `csr_array`, columns ascending.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse as sp
+
+from thccs_fem import jit
+
+__all__ = ["COMPUTED", "EMPTY", "Triplets", "csr", "entries", "first_rows", "product", "rows_of", "stacked", "summed"]
+
+Ints = npt.NDArray[np.int32]
+Floats = npt.NDArray[np.float64]
+Triplets = list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer], Floats | float]]
+
+COMPUTED, EMPTY = -1, -2  # what `product` has in a row that is no unit row
+
+
+def csr(data: Floats, indices: Ints, indptr: Ints, shape: tuple[int, int]) -> sp.csr_array:
+    """Return the matrix of arrays that are known to be right, which are neither looked at nor copied."""
+    matrix = sp.csr_array(shape)
+    matrix.data, matrix.indices, matrix.indptr = data, indices, indptr
+    return matrix
+
+
+def summed(triplets: Triplets, shape: tuple[int, int]) -> sp.csr_array:
+    """Sum (rows, columns, values) into a matrix; negative rows or columns are dropped."""
+    rows = np.concatenate([r for r, _, _ in triplets], dtype=np.int32, casting="same_kind")
+    columns = np.concatenate([c for _, c, _ in triplets], dtype=np.int32, casting="same_kind")
+    values = np.zeros(rows.size)
+    first = 0
+    for r, _, value in triplets:
+        values[first : first + r.size] = value
+        first += r.size
+    indptr = np.zeros(shape[0] + 1, dtype=np.int32)
+    indices, data = np.zeros(rows.size, dtype=np.int32), np.zeros(rows.size)
+    _run("thccs_sum_triplets", rows.size, rows, columns, values, shape[0], indptr, indices, data)
+    return csr(*_trimmed(data, indices, indptr), shape)
+
+
+def product(a: sp.csr_array, b: sp.csr_array, unit: Ints | None = None) -> sp.csr_array:
+    """Return a @ b without entries that are zero.
+
+    Args:
+        a: Shape (m, k).
+        b: Shape (k, n).
+        unit: For each row COMPUTED, or EMPTY, or the column in which it has a 1, shape (m,); None: all are computed.
+    """
+    bound = int(np.diff(b.indptr)[a.indices].sum(dtype=np.int64)) + (0 if unit is None else unit.size)
+    indptr = np.zeros(a.shape[0] + 1, dtype=np.int32)
+    indices, data = np.zeros(bound, dtype=np.int32), np.zeros(bound)
+    place = np.full(b.shape[1], -1, dtype=np.int32)
+    factors = (a.indptr, a.indices, a.data, b.indptr, b.indices, b.data)
+    _run("thccs_product", a.shape[0], *factors, unit, place, indptr, indices, data)
+    return csr(*_trimmed(data, indices, indptr), (a.shape[0], b.shape[1]))
+
+
+def entries(a: sp.csr_array, first_row: int = 0) -> tuple[Ints, Ints, Floats]:
+    """Return a matrix as (rows, columns, values), to be `summed` with others, its first row being `first_row`."""
+    return np.repeat(np.arange(first_row, first_row + a.shape[0], dtype=np.int32), np.diff(a.indptr)), a.indices, a.data
+
+
+def rows_of(a: sp.csr_array, rows: npt.NDArray[np.integer]) -> sp.csr_array:
+    """Return the given rows, in their order, columns in the order that they had."""
+    indptr = np.zeros(rows.size + 1, dtype=np.int32)
+    np.cumsum(np.diff(a.indptr)[rows], out=indptr[1:])
+    indices, data = np.zeros(indptr[-1], dtype=np.int32), np.zeros(indptr[-1])
+    rows = rows.astype(np.int32, copy=False)
+    _run("thccs_rows", rows.size, rows, a.indptr, a.indices, a.data, indptr, indices, data)
+    return csr(data, indices, indptr, (rows.size, a.shape[1]))
+
+
+def first_rows(a: sp.csr_array, count: int) -> sp.csr_array:
+    """Return the first rows."""
+    nnz = a.indptr[count]
+    return csr(a.data[:nnz], a.indices[:nnz], a.indptr[: count + 1], (count, a.shape[1]))
+
+
+def stacked(matrices: Sequence[sp.csr_array]) -> sp.csr_array:
+    """Return matrices with equally many columns, one below the other."""
+    if len(matrices) == 1:
+        return matrices[0]
+    ends = np.cumsum([m.nnz for m in matrices])
+    indptr = np.concatenate(
+        [[0], *(m.indptr[1:] + np.int32(end - m.indptr[-1]) for m, end in zip(matrices, ends, strict=True))],
+        dtype=np.int32,
+    )
+    data, indices = np.concatenate([m.data for m in matrices]), np.concatenate([m.indices for m in matrices])
+    return csr(data, indices, indptr, (indptr.size - 1, matrices[0].shape[1]))
+
+
+def _trimmed(data: Floats, indices: Ints, indptr: Ints) -> tuple[Floats, Ints, Ints]:
+    """Return the arrays without unused space."""
+    nnz = int(indptr[-1])
+    return (data, indices, indptr) if data.size == nnz else (data[:nnz].copy(), indices[:nnz].copy(), indptr)
+
+
+def _run(function: str, *arguments: int | npt.NDArray[Any] | None) -> None:
+    """Call a loop of kernels.c."""
+    module = jit.library()
+    pointer, null = module.ffi.from_buffer, module.ffi.NULL
+    c_types = {"i": "int32_t[]", "f": "double[]"}
+    getattr(module.lib, function)(
+        *(null if a is None else a if isinstance(a, int) else pointer(c_types[a.dtype.kind], a) for a in arguments)
+    )
