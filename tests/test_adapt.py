@@ -121,6 +121,19 @@ def test_nothing_is_marked_where_nothing_is_wrong(name: str, strategy: adapt.Str
     assert adapt.refine(V, marked) is V
 
 
+@pytest.mark.parametrize("strategy", ["worst", "maximum", "dorfler"])
+@each_space
+def test_indicators_that_differ_by_rounding_are_equal(name: str, strategy: adapt.Strategy) -> None:
+    """Of equal ones the first functions are marked, whatever a solver's last digits are."""
+    V = space(name)
+    for exact in (np.ones(V.num_cells), 2.0 ** (np.arange(V.num_cells) % 4)):
+        for seed in range(3):
+            eta = exact * (1.0 + np.random.default_rng(seed).uniform(-1e-9, 1e-9, V.num_cells))
+            np.testing.assert_array_equal(adapt.mark(V, eta, strategy), adapt.mark(V, exact, strategy))
+            cells = adapt.mark_coarsening(V, eta, theta=0.25)
+            np.testing.assert_array_equal(cells, adapt.mark_coarsening(V, exact, theta=0.25))
+
+
 def test_functions_not_components_are_marked() -> None:
     scalar = space("grid")
     V = fem.FunctionSpace(scalar.hierarchy, (2,))
@@ -433,6 +446,11 @@ def test_history_is_printed_as_a_table() -> None:
         "   1      2    120000    130000  3.500e-07    61.50"
     )
     assert str(adapt.History([replace(steps[0], number=7)])).splitlines()[-1].startswith("   7 ")
+    assert str(adapt.History([steps[0], replace(steps[1], imbalance=1.0625)])) == (  # of several ranks
+        "step levels  elements      dofs   estimate  seconds imbalance\n"
+        "   0      1        12        42  1.250e-02     0.25     1.000\n"
+        "   1      2    120000    130000  3.500e-07    61.50     1.062"
+    )
 
 
 def test_a_negative_number_of_steps_is_refused() -> None:

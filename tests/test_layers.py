@@ -10,7 +10,8 @@ ROOT = Path(__file__).parents[1]
 LAYERS = """
     thccs_fem thccs_fem.absent thccs_fem.parallel thccs_fem.index_map thccs_fem.jit thccs_fem.sparse thccs_fem.element
     thccs_fem.polygons thccs_fem.validation thccs_fem.mesh thccs_fem.positions
-    thccs_fem.subdivision thccs_fem.boundary thccs_fem.joined thccs_fem.coarsening thccs_fem.bezier thccs_fem.limit thccs_fem.generators
+    thccs_fem.subdivision thccs_fem.boundary thccs_fem.joined thccs_fem.coarsening thccs_fem.bezier thccs_fem.limit
+    thccs_fem.generators
     thccs_fem.stam thccs_fem.hierarchy thccs_fem.partition thccs_fem.prolongation thccs_fem.extraction thccs_fem.facets
     thccs_fem.quadrature thccs_fem.folds
     thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.expression thccs_fem.fem.checks thccs_fem.fem.forms

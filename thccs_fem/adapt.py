@@ -149,7 +149,7 @@ def _dorfler(
     turn[order] = np.arange(order.size)
     by_cell = sp.csc_array(supports)
     turns = turn[parts.functions.numbers[by_cell.indices]]
-    first = parts.cells.gather(np.minimum.reduceat(turns, by_cell.indptr[: parts.cells.size_local]))
+    first = parts.cells.gather(np.minimum.reduceat(turns, by_cell.indptr[:-1]))
     carried = np.cumsum(np.bincount(first, weights=squares, minlength=order.size))
     last = np.searchsorted(carried, theta * carried[-1] * (1.0 - TIE))
     return np.sort(order[np.unique(first[first <= last])])

@@ -111,9 +111,9 @@ def together[T](comm: Any, work: Callable[[], T]) -> T:
     for rank, report in enumerate(reports):
         if report is not None:
             kind, message = report
-            error = pickle.loads(kind)(f"rank {rank} of {comm.size}: {message}")
-            vars(error)[FIRST] = rank
-            raise error.with_traceback(raised.__traceback__ if raised else None) from None
+            shared = pickle.loads(kind)(f"rank {rank} of {comm.size}: {message}")
+            vars(shared)[FIRST] = rank
+            raise shared.with_traceback(raised.__traceback__ if raised else None) from None
     return result
 
 

@@ -1,8 +1,8 @@
 """Tests that several ranks run together: `mpirun -n 2 python -m pytest tests/parallel/test_x.py`.
 
 Each rank runs all tests, and what comes out of a test is the same on all: it fails everywhere where it failed
-anywhere. Rank 0 prints for all. A rank that fails while others wait for it, in the middle of a test, ends all of them.
-`tests/mpi/test_files.py` runs every file on 2 and on 3 ranks.
+anywhere. Rank 0 prints for all. A rank that fails while others wait for it, in the middle of a test, ends all of them;
+so does a time limit. `tests/mpi/test_on_ranks.py` runs all files on 2 and on 3 ranks.
 """
 
 import faulthandler
@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import numpy as np
 import pytest
 
+TIME_LIMIT = 120.0  # seconds a test; on two processors, idle otherwise, the longest takes ten
 PATIENCE = 10.0  # seconds that a rank on which a test failed waits for the others to end the test
 OUTCOMES = ("passed", "skipped", "failed")
 
@@ -46,14 +48,22 @@ class Together:
         self.stderr = os.fdopen(os.dup(2), "w")  # the terminal: nothing is captured yet
         if self.comm.rank:
             config.pluginmanager.unregister(name="terminalreporter")
-        if "THCCS_DUMP_AFTER" in os.environ:
-            faulthandler.dump_traceback_later(float(os.environ["THCCS_DUMP_AFTER"]), file=self.stderr)
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
         collected = self.comm.allgather((session.testsfailed, [item.nodeid for item in session.items]))
         if any(other != collected[0] for other in collected):
             counts = [(f"{len(names)} tests, {errors} errors") for errors, names in collected]
             pytest.exit(f"the ranks have not collected the same: {counts}", returncode=1)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self) -> Generator[None, object, object]:
+        # Ranks that wait for each other for ever: each shows where it is, and then the first ends them.
+        is_first = self.comm.rank == 0
+        faulthandler.dump_traceback_later(TIME_LIMIT + 2 * is_first, exit=is_first, file=self.stderr)
+        result = yield
+        faulthandler.cancel_dump_traceback_later()
+        PETSc.garbage_cleanup()  # frees what Python has let go of, which is up to all ranks together
+        return result
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(
@@ -84,9 +94,6 @@ class Together:
                 self.stderr.flush()
                 self.comm.Abort(1)
         return outcomes.tolist()
-
-    def pytest_sessionfinish(self) -> None:
-        faulthandler.cancel_dump_traceback_later()
 
 
 def _text(report: pytest.TestReport) -> str:

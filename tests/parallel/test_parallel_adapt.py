@@ -112,9 +112,11 @@ def test_cells_whose_bubbles_have_no_solution_are_counted_on_all_ranks() -> None
 @pytest.mark.parametrize("strategy", ["worst", "maximum", "dorfler"])
 @each_space
 def test_marks(make: Callable[[MPI.Comm], fem.FunctionSpace], strategy: adapt.Strategy) -> None:
-    def marked(comm: MPI.Comm) -> dict[str, Any]:
+    def marked(comm: MPI.Comm) -> list[dict[str, Any]]:
         V = make(comm)
-        eta = np.random.default_rng(1).random(V.num_cells) ** 4
+        return [marks_of(V, np.random.default_rng(seed).random(V.num_cells) ** (1 + 3 * seed)) for seed in range(4)]
+
+    def marks_of(V: fem.FunctionSpace, eta: Floats) -> dict[str, Any]:
         functions = adapt.mark(V, shares(V, eta), strategy)
         cells = adapt.mark_coarsening(V, shares(V, eta))
         assert (cells < V.cells.num_owned).all()

@@ -37,7 +37,6 @@ __all__ = ["LevelMatrix", "Levels", "owners_of", "prolongations_below"]
 
 SMALL = 500  # functions; a direct solver is as fast as any smoother then, and there is no need for coarser meshes
 ROUNDING = 1e-14  # entries of prolongations up to this are zero but for rounding; true ones are 1e-4 and more
-
 NOTHING = (np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32), np.zeros(0))  # rows, columns and values
 
 Levelwise = npt.NDArray[np.int8]
@@ -132,9 +131,10 @@ class Levels:
         """Return the levels of a space, down to the coarsest mesh that its control mesh is a subdivision of."""
         prolongations = prolongations_below(V.hierarchy)
         marks = [np.ones(P.shape[0], dtype=bool) for P in prolongations]
+        coefficients = _coefficients(V)
         for l in range(1, V.num_levels):
-            prolongations.append(_prolongation(V.hierarchy, l))
-            marks.append(_meeting(V.hierarchy, l) | ~_copies(prolongations[-1]))
+            prolongations.append(_prolongation(V.hierarchy, l, coefficients[l - 1]))
+            marks.append(_meeting(V.hierarchy, l, coefficients[l]) | ~_copies(prolongations[-1]))
         k = V.block_size
         if k > 1:
             prolongations = [sp.csr_array(sp.kron(P, sp.eye_array(k), format="csr")) for P in prolongations]
@@ -262,14 +262,25 @@ def prolongations_below(hierarchy: Hierarchy) -> list[sp.csr_array]:
     return prolongations
 
 
-def _prolongation(hierarchy: Hierarchy, l: int) -> sp.csr_array:
-    """Return the prolongation from V_{l-1} to V_l."""
+def _coefficients(V: FunctionSpace) -> Sequence[sp.csr_array]:
+    """Return C_l of each level, on several ranks without keeping them."""
+    hierarchy = V.hierarchy
+    if V.num_levels == 1:
+        return ()  # nobody asks for them
+    if V.index_map.is_whole:
+        return hierarchy.coefficients
+    marks = [np.full(stage.selected.size, l < V.num_levels) for l, stage in enumerate(hierarchy.stages)]
+    return hierarchy.coefficient_rows(marks)
+
+
+def _prolongation(hierarchy: Hierarchy, l: int, of_before: sp.csr_array) -> sp.csr_array:
+    """Return the prolongation from V_{l-1} to V_l, of C_{l-1}."""
     before, stage = hierarchy.stages[l - 1], hierarchy.stages[l]
     first, selected = int(hierarchy.dof_offsets[l - 1]), np.flatnonzero(before.selected)
     assert before.matrix is not None  # every stage but the last has a step
     last = np.arange(selected.size)
     units = sp.csr_array((np.ones(last.size), (selected, last)), shape=(before.selected.size, last.size))
-    coefficients = sp.hstack([hierarchy.coefficients[l - 1][:, :first], units], format="csr")
+    coefficients = sp.hstack([of_before[:, :first], units], format="csr")
     new = _without_rounding(before.matrix[np.flatnonzero(stage.selected)] @ coefficients)
     kept = np.concatenate([np.arange(first), first + last[before.active[selected]]])
     units = sp.csr_array((np.ones(kept.size), (np.arange(kept.size), kept)), shape=(kept.size, new.shape[1]))
@@ -282,11 +293,11 @@ def _without_rounding(P: sp.csr_array) -> sp.csr_array:
     return P
 
 
-def _meeting(hierarchy: Hierarchy, l: int) -> Bools:
-    """Return the functions of V_l that do not vanish on Omega^l."""
+def _meeting(hierarchy: Hierarchy, l: int, coefficients: sp.csr_array) -> Bools:
+    """Return the functions of V_l that do not vanish on Omega^l, of C_l."""
     stage, first = hierarchy.stages[l], int(hierarchy.dof_offsets[l])
     vertices = stage.level.corners_of(neighbourhood(stage.level, stage.inside))
     functions = np.concatenate([vertices, traces_meeting(stage.boundary, stage.inside)])
-    used = hierarchy.coefficients[l][np.flatnonzero(functions)].indices
+    used = coefficients[np.flatnonzero(functions)].indices
     older = np.bincount(used, minlength=first)[:first] > 0
     return np.concatenate([older, np.ones(np.count_nonzero(stage.selected), dtype=bool)])

@@ -68,17 +68,18 @@ def conjugate_gradients(apply: Callable[[Floats], Floats], diagonal: Floats, loa
     residual = load.copy()
     scaled = residual / diagonal[:, None]
     direction = scaled.copy()
-    square = total(comm, (residual * scaled).sum(axis=0))
-    goal = TOLERANCE * _largest(comm, scaled)
+    square, size = _measured(comm, residual, scaled)
+    goal = TOLERANCE * size
     for _ in range(MOST_ITERATIONS):
-        if (_largest(comm, scaled) <= goal).all():
+        if (size <= goal).all():
             return x
         image = apply(direction)
         step = _quotient(square, total(comm, (direction * image).sum(axis=0)))
         x += step * direction
         residual -= step * image
         scaled = residual / diagonal[:, None]
-        before, square = square, total(comm, (residual * scaled).sum(axis=0))
+        before = square
+        square, size = _measured(comm, residual, scaled)
         direction = scaled + _quotient(square, before) * direction
     raise RuntimeError(
         f"conjugate gradients did not converge in {MOST_ITERATIONS} iterations: see that the values are finite, and no "
@@ -86,9 +87,11 @@ def conjugate_gradients(apply: Callable[[Floats], Floats], diagonal: Floats, loa
     )
 
 
-def _largest(comm: Any, values: Floats) -> Floats:
-    """Return the largest absolute value in each column, on all ranks, shape (k,)."""
-    return gathered(comm, np.abs(values).max(axis=0, initial=0.0)[None]).max(axis=0)
+def _measured(comm: Any, residual: Floats, scaled: Floats) -> tuple[Floats, Floats]:
+    """Return the inner product of two vectors and the largest entry of the second, for each column, both (k,)."""
+    here = np.stack([(residual * scaled).sum(axis=0), np.abs(scaled).max(axis=0, initial=0.0)])
+    of_ranks = gathered(comm, here[None])
+    return of_ranks[:, 0].sum(axis=0), of_ranks[:, 1].max(axis=0)
 
 
 def _quotient(a: Floats, b: Floats) -> Floats:

@@ -21,6 +21,10 @@ def point_values(
     point i does the work F_i . v(x_i) on a test function v, so that forces F of shape (n, k) are the load
     ``(B.T @ F).ravel()``.
 
+    On several ranks, all of which give the same points, columns are local functions. Rows of points on cells that a rank
+    does not hold are zero, so that values are those of `Function.eval`; but a rank holds all cells of the functions
+    that it owns, so that its part of the load is complete.
+
     Args:
         V: The space; of one with vector values the scalar functions are meant.
         faces: Faces of the control mesh, shape (n,).
@@ -28,7 +32,8 @@ def point_values(
         corner: Sub-quad of a polygon, shape (n,).
 
     Returns:
-        Shape (n, V.num_functions); 16 entries a row in regular cells of level 0.
+        Shape (n, V.num_functions), or on several ranks as many columns as there are local functions; 16 entries a row in
+        regular cells of level 0.
 
     Raises:
         TypeError: If faces or corners are no integers, or V is no space of splines.
@@ -36,7 +41,8 @@ def point_values(
     """
     check_space(V, "point_values")
     piece, position = V.cells.locate(faces, uv, corner)
-    local = element.bicubic_values(position).ravel()
-    number = np.arange(local.size + 1, dtype=np.int32)
-    at_points = sp.csr_array((local, number[:-1], number[::16]), shape=(piece.size, local.size))
-    return sp.csr_array(at_points @ V.cells.rows(piece))
+    held = piece >= 0
+    local = element.bicubic_values(position[held]).ravel()
+    ends = np.append(0, 16 * np.cumsum(held)).astype(np.int32)
+    at_points = sp.csr_array((local, np.arange(local.size, dtype=np.int32), ends), shape=(piece.size, local.size))
+    return sp.csr_array(at_points @ V.cells.rows(piece[held]))
