@@ -21,21 +21,28 @@
 
 # %%
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
 
 import ufl
-from thccs_fem import adapt, estimate, fem, generators, plot
+from thccs_fem import adapt, estimate, fem, generators, parallel, plot
 from thccs_fem.forms import minimal_surface, poisson
 
 try:
-    from mpi4py import MPI  # noqa: F401  # petsc4py wants it loaded
+    from mpi4py import MPI
 
     from thccs_fem.fem.petsc import LinearProblem, NonlinearProblem
+
+    comm = MPI.COMM_WORLD
 except ImportError:  # no PETSc here: the same problems, solved by SciPy
     from thccs_fem.fem.scipy import LinearProblem, NonlinearProblem
 
+    comm = None
+
+if parallel.rank_of(comm) > 0:
+    sys.stdout = None  # rank 0 prints for all
 steps = int(os.environ.get("STEPS", "4"))
 out = Path("out")
 out.mkdir(exist_ok=True)
@@ -64,7 +71,7 @@ def film(V: fem.FunctionSpace, g) -> tuple[fem.Function, float, list[float]]:
 
 
 def area(uh: fem.Function) -> float:
-    return fem.assemble_scalar(fem.form(minimal_surface.area(uh)))
+    return parallel.total(comm, fem.assemble_scalar(fem.form(minimal_surface.area(uh))))
 
 
 # %% [markdown]
@@ -81,7 +88,7 @@ def scherk(x):
 
 
 errors = []
-V = fem.functionspace(generators.rectangle((4, 4), (-1.2, -1.2), (1.2, 1.2)), ("THCCS", 3))
+V = fem.functionspace(generators.rectangle((4, 4), (-1.2, -1.2), (1.2, 1.2), comm=comm), ("THCCS", 3))
 for step in range(min(steps, 4)):
     V = adapt.refine(V, np.arange(V.num_functions)) if step else V
     uh, _, norms = film(V, scherk)
@@ -99,7 +106,7 @@ for step in range(min(steps, 4)):
 # less.
 
 # %%
-V = fem.functionspace(generators.disc(4 if steps > 3 else 2), ("THCCS", 3))
+V = fem.functionspace(generators.disc(4 if steps > 3 else 2, comm=comm), ("THCCS", 3))
 V = adapt.refine(V, np.arange(V.num_functions))
 
 
@@ -109,7 +116,7 @@ def ring(x):
 
 uh, harmonic_area, norms = film(V, ring)
 film_area = area(uh)
-disc_area = fem.assemble_scalar(fem.form(fem.Constant(V.mesh, 1.0) * ufl.dx))
+disc_area = area(fem.Function(V))
 print(f"area of the disc {disc_area:.4f}, of the harmonic graph {harmonic_area:.4f}, of the film {film_area:.4f}")
 print(f"{len(norms) - 1} iterations")
 plot.plot(uh, out / "minimal_surface.png", warp=1.0, camera=(0.5, -1.6, 1.6), cmap="coolwarm")

@@ -18,6 +18,7 @@
 
 # %%
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,16 +26,22 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 import ufl
-from thccs_fem import fem, generators, plot
+from thccs_fem import fem, generators, parallel, plot
 from thccs_fem.forms import eigenmodes
 
 try:
-    from mpi4py import MPI  # noqa: F401  # petsc4py wants it loaded
+    from mpi4py import MPI
 
     from thccs_fem.fem.petsc import EigenProblem
+
+    comm = MPI.COMM_WORLD
 except ImportError:  # no SLEPc here: the same problem, solved by SciPy
     from thccs_fem.fem.scipy import EigenProblem
 
+    comm = None
+
+if parallel.rank_of(comm) > 0:
+    sys.stdout = None  # rank 0 prints for all
 steps = int(os.environ.get("STEPS", "4"))
 out = Path("out")
 out.mkdir(exist_ok=True)
@@ -65,7 +72,7 @@ def modes(V: fem.FunctionSpace, number: int) -> tuple[np.ndarray, list[fem.Funct
 exact = np.array([l * (l + 1.0) for l in range(4) for _ in range(2 * l + 1)])
 errors = []
 for n in (4, 8, 16, 32)[:steps]:
-    V = fem.functionspace(generators.interpolated(generators.cube_sphere(n)), ("THCCS", 3))
+    V = fem.functionspace(generators.interpolated(generators.cube_sphere(n, comm=comm)), ("THCCS", 3))
     eigenvalues, _ = modes(V, exact.size)
     errors.append(np.abs(eigenvalues - exact).max())
     shown = [f"{eigenvalues[l * l]:.5f} .. {eigenvalues[(l + 1) ** 2 - 1]:.5f}" for l in (1, 2, 3)]
@@ -78,7 +85,7 @@ for n in (4, 8, 16, 32)[:steps]:
 # rising pitch the three rings have waves around them.
 
 # %%
-V = fem.functionspace(generators.genus3(levels=2 if steps > 3 else 1), ("THCCS", 3))
+V = fem.functionspace(generators.genus3(levels=2 if steps > 3 else 1, comm=comm), ("THCCS", 3))
 eigenvalues, functions = modes(V, 20)
 print("eigenvalues:", np.array2string(eigenvalues, precision=3, suppress_small=True, max_line_width=100))
 
@@ -86,22 +93,28 @@ SHOWN = (1, 2, 3, 4, 7, 8)
 figure = Figure(figsize=(12, 5.2), layout="constrained")
 for axes, k in zip(figure.subplots(2, 3).flat, SHOWN, strict=True):
     file = out / f"mode_{k}.png"
-    largest = np.abs(functions[k].x.array).max()
+    largest = parallel.largest(comm, np.abs(functions[k].x.array).max())
     plot.plot(functions[k], file, clim=(-largest, largest), cmap="RdBu_r", lines=False, window_size=(800, 512))
     picture = imread(file)[:, :680]  # without the colour bar
     rows, columns = (np.flatnonzero((picture[..., :3] < 1.0).any(axis=(axis, 2))) for axis in (1, 0))
     axes.imshow(picture[rows[0] : rows[-1], columns[0] : columns[-1]])
     axes.set_title(rf"mode {k}: $\lambda$ = {eigenvalues[k]:.3f}", fontsize="medium")
     axes.set_axis_off()
-figure.savefig(out / "vibration_modes.png", dpi=130)
+if parallel.rank_of(comm) == 0:
+    figure.savefig(out / "vibration_modes.png", dpi=130)
 print(f"Wrote {out / 'vibration_modes.png'}")
 
 # %% [markdown]
 # Modes of different pitch are orthogonal, and each has the norm 1; the energy of a mode is its eigenvalue.
 
+
 # %%
-mass = [[fem.assemble_scalar(fem.form(eigenmodes.m(functions[i], functions[j]))) for i in (1, 2)] for j in (1, 2)]
-energy = fem.assemble_scalar(fem.form(eigenmodes.a(functions[8], functions[8])))
+def integral(form: ufl.Form) -> float:
+    return parallel.total(comm, fem.assemble_scalar(fem.form(form)))
+
+
+mass = [[integral(eigenmodes.m(functions[i], functions[j])) for i in (1, 2)] for j in (1, 2)]
+energy = integral(eigenmodes.a(functions[8], functions[8]))
 print(f"masses {np.round(mass, 12).tolist()}, energy of mode 8 {energy:.6f}")
 
 # %% [markdown]

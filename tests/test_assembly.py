@@ -22,7 +22,9 @@ from thccs_fem.extraction import Batch, Cells
 from thccs_fem.fem import sparsity
 from thccs_fem.fem.forms import Form
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.index_map import IndexMap
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.partition import Partition
 from ufl import div, dx, grad, inner
 
 Floats = npt.NDArray[np.float64]
@@ -162,6 +164,12 @@ class RandomCells:
     points: Floats
     batches: tuple[Batch, ...]
     cell_dofs = Cells.cell_dofs
+    num_owned = Cells.num_owned
+    with_own_dofs = Cells.with_own_dofs
+
+    @property
+    def partition(self) -> Partition:
+        return Partition(IndexMap.whole(self.num_cells), IndexMap.whole(self.num_dofs), 1.0)
 
 
 def random_cells(num_dofs: int, width: int, num_cells: int = 7, seed: int = 0) -> RandomCells:

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 import ufl
 from thccs_fem import adapt, fem, generators
-from thccs_fem.fem import blocks, scipy
+from thccs_fem.fem import scipy
 from thccs_fem.fem.linear import LinearSystem
 from thccs_fem.fem.nonlinear import NonlinearSystem
 from thccs_fem.fem.space import FunctionSpace
@@ -378,30 +378,6 @@ def test_forms_that_do_not_fit() -> None:
     other = ufl.TestFunction(on_mesh_of(V, (), (0,))) * dx
     with pytest.raises(ValueError, match=r"the trial function of a\[1\] is in .* an equation needs the same space"):
         LinearSystem([[m, None], [None, m]], [L, other])
-
-
-def test_conditions_that_do_not_fit() -> None:
-    V = square()
-    Q = on_mesh_of(V, (2,))
-    layout = blocks.Layout((V, Q))
-    with pytest.raises(ValueError, match=r"a condition is on .*, but the unknowns are in"):
-        layout.constraints([fixed(on_mesh_of(V, (), (0,)))])
-    with pytest.raises(TypeError, match="bcs is a single condition"):
-        layout.constraints(fixed(V))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="bcs holds a float"):
-        layout.constraints([0.0])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match=r"the space of the unknowns \[0, 1\]: give a list of conditions for each"):
-        blocks.Layout((V, V)).constraints([fixed(V)])
-
-
-def test_conditions_find_their_unknown() -> None:
-    V = square()
-    same, Q = on_mesh_of(V), on_mesh_of(V, (2,))
-    bc = fem.dirichletbc(1.0, [3], V)
-    for spaces, expected in (((Q, V), 2 * 49 + 3), ((V, same), 3), ((same, V), 49 + 3), ((same, Q), 3)):
-        dofs, values = blocks.Layout(spaces).constraints([bc])
-        assert dofs.tolist() == [expected]
-        assert values.tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("kind", "unknowns"), [("nest", 1), ("aij", 2)])

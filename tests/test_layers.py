@@ -16,8 +16,8 @@ LAYERS = """
     thccs_fem.quadrature thccs_fem.folds
     thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.expression thccs_fem.fem.checks thccs_fem.fem.forms
     thccs_fem.fem.sparsity thccs_fem.fem.loops thccs_fem.fem.mass
-    thccs_fem.fem.points thccs_fem.fem.entries thccs_fem.fem.assembly thccs_fem.fem.fitting thccs_fem.fem.bcs thccs_fem.fem.layout
-    thccs_fem.fem.blocks
+    thccs_fem.fem.points thccs_fem.fem.entries thccs_fem.fem.assembly thccs_fem.fem.fitting thccs_fem.fem.bcs
+    thccs_fem.fem.layout thccs_fem.fem.blocks
     thccs_fem.fem.linear thccs_fem.fem.nonlinear thccs_fem.fem.eigen
     thccs_fem.fem.scipy.linear thccs_fem.fem.scipy.nonlinear thccs_fem.fem.scipy.eigen thccs_fem.fem.scipy
     thccs_fem.fem.project thccs_fem.fem

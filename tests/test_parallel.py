@@ -17,10 +17,10 @@ SIZES = pytest.mark.parametrize("size", [1, 2, 3])
 
 
 class MeshError(ValueError):
-    """Is not made from its message."""
+    """Is not made from its message: that would be another one."""
 
-    def __init__(self, face: int, vertex: int) -> None:
-        super().__init__(f"vertex {vertex} of face {face} is bad")
+    def __init__(self, face: int) -> None:
+        super().__init__(f"face {face} is bad")
 
 
 def no_bytes() -> UnicodeDecodeError:
@@ -94,11 +94,11 @@ def test_each_rank_does_its_own_work(size: int) -> None:
 @pytest.mark.parametrize(
     ("error", "seen"),
     [
-        (ValueError("face 3 is bad"), "ValueError: rank 1 of 3: face 3 is bad"),
+        (ValueError("no mesh"), "ValueError: rank 1 of 3: no mesh"),
         (ValueError(), "ValueError: rank 1 of 3: "),
         (KeyError("name"), "KeyError: \"rank 1 of 3: 'name'\""),
         (FileNotFoundError(2, "no", "a.obj"), "FileNotFoundError: rank 1 of 3: [Errno 2] no: 'a.obj'"),
-        (MeshError(3, 4), "ValueError: rank 1 of 3: vertex 4 of face 3 is bad"),
+        (MeshError(3), "ValueError: rank 1 of 3: face 3 is bad"),
         (no_bytes(), f"UnicodeError: rank 1 of 3: {no_bytes()}"),
         (local_class(), "KeyError: \"rank 1 of 3: 'key'\""),
         (ExceptionGroup("some", [ValueError("one")]), "Exception: rank 1 of 3: some (1 sub-exception)"),
@@ -112,6 +112,7 @@ def test_error_of_one_rank_is_raised_on_all(error: BaseException, seen: str) -> 
     assert texts(found) == [seen] * 3
     places = [traceback.extract_tb(o.__traceback__)[-1].name for o in found if isinstance(o, BaseException)]
     assert places == ["together", "work", "together"]  # the failed rank knows where
+    assert not any(o.__cause__ for o in found if isinstance(o, BaseException))  # or there were two tracebacks
 
 
 def test_same_error_of_all_ranks_stays_as_it_is() -> None:
@@ -137,7 +138,7 @@ def test_interrupt_does_not_wait_for_other_ranks() -> None:
     [
         (FileNotFoundError(2, "no such file", "a.obj"), "FileNotFoundError: [Errno 2] no such file: 'a.obj'"),
         (no_bytes(), f"UnicodeDecodeError: {no_bytes()}"),
-        (MeshError(3, 4), "ValueError: vertex 4 of face 3 is bad"),
+        (MeshError(3), "ValueError: face 3 is bad"),
         (local_class(), "KeyError: \"'key'\""),
         (SystemExit(3), "SystemExit: 3"),
     ],

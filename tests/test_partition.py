@@ -233,16 +233,16 @@ def num_cut(hierarchy: Hierarchy, owners: Ints) -> int:
     return int(np.count_nonzero(owners[a] != owners[b]))
 
 
-@pytest.mark.parametrize(("size", "cut"), [(2, 2 * 16), (4, 4 * 16), (8, 8 * 16)])
-def test_a_torus_is_cut_across_its_tube(size: int, cut: int) -> None:
+@pytest.mark.parametrize("size", [2, 4, 8])
+def test_a_torus_is_cut_across_its_tube(size: int) -> None:
     hierarchy = Hierarchy.on(generators.torus((64, 16)))
-    assert num_cut(hierarchy, cell_owners(hierarchy, size)) <= cut * (1 if size < 8 else 2)  # planes are not radial
+    assert num_cut(hierarchy, cell_owners(hierarchy, size)) == size * 16
 
 
-def test_a_plane_is_cut_in_squares() -> None:
+@pytest.mark.parametrize(("size", "cut"), [(2, 32), (4, 64)])
+def test_a_square_is_cut_in_squares(size: int, cut: int) -> None:
     hierarchy = Hierarchy.on(generators.rectangle((32, 32)), "crease")
-    for size, cut in ((2, 32), (4, 64)):
-        assert num_cut(hierarchy, cell_owners(hierarchy, size)) <= 1.1 * cut  # cells at the rim weigh more
+    assert num_cut(hierarchy, cell_owners(hierarchy, size)) == cut
 
 
 def test_a_turned_bar_is_cut_across() -> None:

@@ -244,13 +244,14 @@ def test_older_file_stays_until_the_new_one_is_complete(tmp_path: Path, monkeypa
     assert file.stat().st_mode == other.stat().st_mode
 
 
+@pytest.mark.parametrize("stem", ["u", "ü & 'v'"])
 @pytest.mark.parametrize("fails", ["_write_data", "_write_index"])
 def test_older_index_keeps_its_pieces_until_the_new_one_is_complete(
-    fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fails: str, stem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file, u = tmp_path / "u.pvtu", some_function(space(ZOO["torus"]()))
+    file, u = tmp_path / f"{stem}.pvtu", some_function(space(ZOO["torus"]()))
     vtk.write_vtu(file, u)
-    assert names_in(tmp_path) == ["u.pvtu", "u_pieces0/u_0.vtu"]
+    assert names_in(tmp_path) == [f"{stem}.pvtu", f"{stem}_pieces0/{stem}_0.vtu"]
     before = u.x.array.copy()
     for k in (1, 0):
         first = pyvista.read(file).point_data["u"]
@@ -259,10 +260,10 @@ def test_older_index_keeps_its_pieces_until_the_new_one_is_complete(
             patch.setattr(vtk, fails, half)
             with pytest.raises(OSError, match="disk full"):
                 vtk.write_vtu(file, u)
-        assert names_in(tmp_path) == ["u.pvtu", f"u_pieces{1 - k}/u_0.vtu"]
+        assert names_in(tmp_path) == [f"{stem}.pvtu", f"{stem}_pieces{1 - k}/{stem}_0.vtu"]
         np.testing.assert_array_equal(pyvista.read(file).point_data["u"], first)
         vtk.write_vtu(file, u)
-        assert names_in(tmp_path) == ["u.pvtu", f"u_pieces{k}/u_0.vtu"]
+        assert names_in(tmp_path) == [f"{stem}.pvtu", f"{stem}_pieces{k}/{stem}_0.vtu"]
         np.testing.assert_array_equal(pyvista.read(file).point_data["u"], vtk.bezier_grid(u).point_data["u"])
 
 

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 from thccs_fem.boundary import Boundary, BoundaryRule, subdivision_matrix, to_dofs
+from thccs_fem.sparse import product, rows_of
 from thccs_fem.subdivision import Bools, Ints, Level, rim_distance, subdivide
 
 __all__ = ["coarsened"]
@@ -129,5 +130,5 @@ def _matrix(coarse: Level, level: Level, children: Ints, rule: BoundaryRule) -> 
     before, after, own = (Boundary.of(of, rule) for of in (coarse, step.fine, level))
     nth = np.arange(after.vertex.size) + level.num_vertices - after.first[after.vertex]
     functions = np.concatenate([vertex, own.first[vertex[after.vertex]] + nth])
-    matrix = to_dofs(after) @ subdivision_matrix(before, after, step) @ before.to_points
-    return sp.csr_array(matrix[np.argsort(functions)])
+    matrix = product(product(to_dofs(after), subdivision_matrix(before, after, step)), before.to_points)
+    return rows_of(matrix, np.argsort(functions))

@@ -182,6 +182,15 @@ class Cells:
             dofs[place[used]] = batch.dofs[used]
         return offsets, dofs
 
+    @cached_property
+    def with_own_dofs(self) -> Bools:
+        """Which cells have a function that this rank owns, shape (num_cells,)."""
+        marks = np.zeros(self.num_cells, dtype=bool)
+        for batch in self.batches:
+            own = (batch.dofs >= 0) & (batch.dofs < self.partition.functions.size_local)
+            marks[batch.cells[own.any(axis=1)]] = True
+        return marks
+
     @property
     def tag(self) -> Ints:
         """Tag of each cell, that of its face of the control mesh, shape (num_cells,)."""

@@ -735,3 +735,30 @@ void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, 
     memcpy(data + indptr[i], a_data + begin, size * sizeof *data);
   }
 }
+
+void thccs_split_pattern(int32_t num_rows, int32_t num_owned, const int32_t *indptr, const int32_t *indices,
+                         const int32_t *numbers, int32_t *own_indptr, int32_t *own_indices, int32_t *other_indptr,
+                         int32_t *other_indices)
+{
+  int32_t own = 0, other = 0;
+  own_indptr[0] = other_indptr[0] = 0;
+  for (int32_t i = 0; i < num_rows; ++i) {
+    for (int32_t k = indptr[i]; k < indptr[i + 1]; ++k)
+      if (indices[k] < num_owned)
+        own_indices[own++] = indices[k];
+      else
+        other_indices[other++] = numbers[indices[k] - num_owned];
+    own_indptr[i + 1] = own;
+    other_indptr[i + 1] = other;
+  }
+}
+
+void thccs_split_values(int64_t n, int32_t num_owned, const int32_t *indices, const double *restrict values,
+                        double *restrict own, double *restrict others)
+{
+  for (int64_t k = 0; k < n; ++k)
+    if (indices[k] < num_owned)
+      *own++ = values[k];
+    else
+      *others++ = values[k];
+}

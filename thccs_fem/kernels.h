@@ -94,12 +94,11 @@ void thccs_tabulate(thccs_kernel *kernel, int32_t n, int32_t num_values, int32_t
 void thccs_evaluate_patches(int64_t n, const int32_t *patches, const double *uv, int32_t size,
                             const double *coefficients, int32_t rows, double *out);
 
-/* The different columns of the rows of each cell. Cell c has rows[cell_rows[c] .. cell_rows[c + 1]] of the CSR
-   matrix (indptr, indices). First with columns NULL: counts[c] becomes their number; then with offsets (cells + 1) the
-   columns are written, ascending. seen (matrix columns) is -1 before each call. */
+/* The different columns of the rows of each cell, ascending: columns[offsets[c] .. offsets[c + 1]], offsets (cells + 1).
+   Cell c has rows[cell_rows[c] .. cell_rows[c + 1]] of the CSR matrix (indptr, indices). columns has a place for each
+   entry of these rows; seen (matrix columns) is -1 before. */
 void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
-                        const int32_t *indices, int32_t *seen, int32_t *counts, const int32_t *offsets,
-                        int32_t *columns);
+                        const int32_t *indices, int32_t *seen, int32_t *offsets, int32_t *columns);
 
 /* The rows of each cell as dense blocks over its columns. The block of cell c, width[c] wide, begins at
    values[starts[c]]. place (matrix columns) is scratch; values are 0 before. */
@@ -121,3 +120,13 @@ void thccs_product(int32_t num_rows, const int32_t *a_indptr, const int32_t *a_i
 /* Rows of a CSR matrix, in the given order; indptr is that of the result. */
 void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, const int32_t *a_indices,
                 const double *a_data, const int32_t *indptr, int32_t *indices, double *data);
+
+/* Where the entries of a CSR matrix go that is split into its first num_owned columns, own, and the others, whose
+   columns become numbers[column - num_owned]. own_indptr and other_indptr have num_rows + 1 places. */
+void thccs_split_pattern(int32_t num_rows, int32_t num_owned, const int32_t *indptr, const int32_t *indices,
+                         const int32_t *numbers, int32_t *own_indptr, int32_t *own_indices, int32_t *other_indptr,
+                         int32_t *other_indices);
+
+/* The n values of such a matrix. */
+void thccs_split_values(int64_t n, int32_t num_owned, const int32_t *indices, const double *values, double *own,
+                        double *others);

@@ -5,6 +5,7 @@ functions but `size_of`, `rank_of` and `end_together` are collective: every rank
 same order. What they return is the same on all ranks to the last bit, so that every rank decides alike.
 """
 
+import os
 import pickle
 import sys
 import time
@@ -199,11 +200,12 @@ class _EndTogether:
     shows: Hook
 
     def __call__(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-        line = f"{kind.__name__}: {error}"
         try:
-            failed = self._failed(line)
-        except Exception:  # the communicator is no longer there, say: then this rank stands for itself
-            failed = {self.comm.rank: line}
+            failed = self._failed(f"{kind.__name__}: {error}")
+        except Exception:  # the communicator is no longer there: who ends without MPI's leave ends the others, too
+            self.shows(kind, error, trace)
+            sys.stderr.flush()
+            os._exit(1)
         first = getattr(error, FIRST, -1)  # which has the traceback that leads to where it happened
         if self.comm.rank == (first if first in failed else min(failed)):
             self._show(failed, kind, error, trace)

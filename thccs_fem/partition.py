@@ -1,10 +1,11 @@
 """Which rank owns which cells and functions of a hierarchy, and of which others it holds copies.
 
-Every rank holds the control mesh and the hierarchy's faces and keys, so that each finds out by itself what is owned by
-whom.  What follows from them, cells with their operators, coefficients, matrices, is there for a rank's part alone.
+Every rank holds the control mesh and the hierarchy's faces and keys.  What follows from them, cells with their
+operators, coefficients, matrices, is there for a rank's part alone.
 
-*Cells* are cut in two by a plane, each part again, until there is one for each rank; all have about the same weight.  A
-refined hierarchy is cut anew.  A *function* belongs to the lowest rank that has a cell at its vertex.
+*Cells* are cut in two by a plane, each part again, until there is one for each rank; all have about the same weight.
+Rank 0 cuts for all; the rest each rank finds out by itself.  A refined hierarchy is cut anew.  A *function* belongs to
+the lowest rank that has a cell at its vertex.
 
 A rank holds, beside the cells it owns, all those on which one of its functions does not vanish, and those beside them:
 so its rows of a matrix are complete without a word from others (integrals over facets between cells included).  And it

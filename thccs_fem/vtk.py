@@ -84,8 +84,8 @@ def write_vtu(
     if path.suffix not in (".vtu", ".pvtu"):
         raise ValueError(f"the file is to be called {str(path)!r}, but the name must end in .vtu or .pvtu")
     V, functions = _space_and_functions(uh)
-    contents = _contents(V, functions, cell_data, owned_pieces(V.cells))
     by_first_rank(V.mesh.comm, lambda: _check_directory(path))
+    contents = _contents(V, functions, cell_data, owned_pieces(V.cells))
     write = _write_file if path.suffix == ".vtu" else _write_index_and_pieces
     write(path, contents, V.mesh.comm)
 
@@ -367,7 +367,7 @@ def _write_index_and_pieces(path: Path, contents: _Contents, comm: Any) -> None:
     """Write a file of each rank, then the index of them; collective."""
     # One of two folders, in turn: the files that an older index names stay until the new one is in its place.
     new, old = (path.with_name(f"{path.stem}_pieces{k}") for k in (0, 1))
-    if by_first_rank(comm, lambda: path.is_file() and f'"{new.name}/' in path.read_text(errors="replace")):
+    if by_first_rank(comm, lambda: _names(path, new)):
         new, old = old, new
     pieces = [new / f"{path.stem}_{rank}.vtu" for rank in range(size_of(comm))]
     outdated = new
@@ -381,6 +381,12 @@ def _write_index_and_pieces(path: Path, contents: _Contents, comm: Any) -> None:
             _remove(outdated)
 
 
+def _names(index: Path, folder: Path) -> bool:
+    """Return whether there is an index that names a file in a folder."""
+    begin = quoteattr(f"{folder.name}/").strip("\"'")
+    return index.is_file() and begin in index.read_text(encoding="utf-8", errors="replace")
+
+
 def _make_empty(folder: Path) -> None:
     _remove(folder)
     folder.mkdir(exist_ok=True)
@@ -388,9 +394,9 @@ def _make_empty(folder: Path) -> None:
 
 def _remove(folder: Path) -> None:
     """Remove a folder of pieces, unless someone keeps other files there."""
-    for piece in folder.glob("*.vtu"):
-        piece.unlink()
     with suppress(OSError):
+        for piece in folder.glob("*.vtu"):
+            piece.unlink()
         folder.rmdir()
 
 
@@ -404,7 +410,7 @@ def _write_index(path: Path, contents: _Contents, pieces: Sequence[Path]) -> Non
     lines.append("</PUnstructuredGrid>")
     with _drafts(path, None) as folder, _telling(path):
         draft = folder / path.name
-        draft.write_text("\n".join([_first_line("PUnstructuredGrid"), *lines, "</VTKFile>\n"]))
+        draft.write_text("\n".join([_first_line("PUnstructuredGrid"), *lines, "</VTKFile>\n"]), encoding="utf-8")
         draft.replace(path)
 
 

@@ -81,6 +81,22 @@ def test_different_errors_of_all_ranks(tmp_path: Path) -> None:
     assert output.endswith(f"\n{first}rank 1 of 2 failed, too: {second}")
 
 
+def test_communicator_that_is_gone(tmp_path: Path) -> None:
+    script = """
+part = comm.Dup()
+sys.excepthook = sys.__excepthook__
+generators.rectangle((1, 1), comm=part)
+part.Free()
+comm.barrier()
+if comm.rank == 1:
+    raise ArithmeticError("one rank alone")
+comm.barrier()
+"""
+    output = ending(tmp_path, 2, script)
+    assert output.startswith("Traceback")
+    assert "\nArithmeticError: one rank alone\n" in output
+
+
 def test_what_all_ranks_catch_ends_nothing(tmp_path: Path) -> None:
     file = tmp_path / "script.py"
     file.write_text(

@@ -16,6 +16,7 @@ DEMOS = Path(__file__).parents[2] / "demos"
 FIGURES: dict[str, tuple[int, Callable[[dict[str, Any]], list[Any]]]] = {
     "laplace_on_surface": (1, lambda of: [of["energies"], of["history"].steps[-1].dofs]),
     "poisson_l_domain": (3, lambda of: [of["energies"], of["estimated"], of["dofs"], of["uniform"]]),
+    "minimal_surface": (3, lambda of: [of["errors"], of["film_area"], of["harmonic_area"], of["disc_area"]]),
     "scordelis_lo_roof": (2, lambda of: of["deflections"]),
     "cahn_hilliard": (3, lambda of: [of["times"], of["dofs"], of["masses"], of["lost"]]),
 }

@@ -13,6 +13,7 @@ from spread import CLOSED, WITH_RIM, Maker, by_number, refined, space, whole
 import ufl
 from thccs_fem import fem, generators
 from thccs_fem.fem import petsc, scipy
+from thccs_fem.fem.layout import Layout
 from thccs_fem.fem.linear import is_symmetric
 from thccs_fem.fem.petsc import LinearProblem
 from thccs_fem.fem.space import FunctionSpace
@@ -99,8 +100,8 @@ def test_arguments_on_different_hierarchies() -> None:
 
 
 def test_columns_that_a_rank_does_not_hold_are_refused() -> None:
-    coarse = space(WITH_RIM["wheel"], MPI.COMM_WORLD)
-    fine = refined(coarse)
+    coarse = space(lambda comm: generators.l_domain(4, comm=comm), MPI.COMM_WORLD)
+    fine = refined(refined(coarse))
     with pytest.raises(NotImplementedError, match=r"are in columns that it does not hold.* use fem\.petsc\.assemble"):
         fem.assemble_matrix(fem.form(ufl.TrialFunction(fine) * ufl.TestFunction(coarse) * dx))
 
@@ -108,9 +109,7 @@ def test_columns_that_a_rank_does_not_hold_are_refused() -> None:
 def test_symmetry_is_seen_across_ranks(comm: MPI.Comm) -> None:
     V = space(CLOSED["torus"], comm)
     A = fem.assemble_matrix(fem.form(energy(V)))
-    numbering = petsc.LinearProblem(
-        energy(V), ufl.TestFunction(V) * dx, petsc_options_prefix="s_"
-    )._system.layout.numbering
+    numbering = Layout((V,)).numbering
     assert numbering is not None
     assert is_symmetric(A, numbering)
     ghosts = np.flatnonzero(A.indices >= V.num_owned_dofs)
@@ -123,7 +122,7 @@ def test_symmetry_is_seen_across_ranks(comm: MPI.Comm) -> None:
 # ---- Problems
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", ["chosen", "cg"])
 @pytest.mark.parametrize(("name", "shape"), [("l domain", ()), ("wheel", (2,)), ("one cell", ())])
 def test_prescribed_values(name: str, shape: tuple[int, ...], solver: str) -> None:
     def work(comm: MPI.Comm) -> list[Any]:
@@ -157,13 +156,11 @@ def test_constants_in_the_kernel(name: str, shape: tuple[int, ...], solver: str)
         assert constants is not None
         return [u, constants.num_constants, constants.areas]
 
-    # A condition number of up to 1e3 in each of these, so far from 1e-10.
     (_, count, _) = same_as_in_serial(work)
     assert count == (2 if name == "two parts" else 1) * int(np.prod(shape))
 
 
-@pytest.mark.parametrize("options", [{}, FIELDS], ids=["chosen", "fieldsplit"])
-@pytest.mark.parametrize("kind", ["mpi", "nest"])
+@pytest.mark.parametrize(("kind", "options"), [("mpi", {}), ("mpi", FIELDS), ("nest", {"ksp_rtol": 1e-14})])
 @pytest.mark.parametrize("is_same", [True, False], ids=["one hierarchy", "two hierarchies"])
 def test_two_unknowns(is_same: bool, kind: Any, options: dict[str, Any]) -> None:
     def work(comm: MPI.Comm) -> list[Any]:
@@ -174,9 +171,8 @@ def test_two_unknowns(is_same: bool, kind: Any, options: dict[str, Any]) -> None
         L = [None, by_number(Q) * q * dx]
         load = np.concatenate([fem.assemble_vector(fem.form(inner(by_number(V), v) * dx)), np.zeros(Q.num_local_dofs)])
         bcs = [fem.dirichletbc(0.5, fem.boundary_dofs(V), V)]
-        problem = LinearProblem(
-            a, L, bcs=bcs, load=load, petsc_options_prefix="b_", petsc_options={"ksp_rtol": 1e-14, **options}, kind=kind
-        )
+        given = {"petsc_options_prefix": "b_", "petsc_options": options, "kind": kind}
+        problem = LinearProblem(a, L, bcs=bcs, load=load, **given)
         return [whole(f) for f in problem.solve()]
 
     same_as_in_serial(work)

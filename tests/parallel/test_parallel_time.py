@@ -32,11 +32,11 @@ def test_spaces_may_change(scheme: Any) -> None:
         problem = TimeProblem(
             F, u, udot, dt=0.02, scheme=scheme, bcs=rising, petsc_options_prefix="t_", petsc_options=TIGHT
         )
-        states = [whole(problem.solve(0.06))]
+        states = [whole(problem.solve(0.04))]
         problem = problem.with_space(refined(V), adapt.transfer)
-        states.append(whole(problem.solve(0.1)))
+        states.append(whole(problem.solve(0.06)))
         problem.u.x.array[:] *= 0.5  # what was before is no history
-        return [*states, whole(problem.solve(0.14))]
+        return [*states, whole(problem.solve(0.08))]
 
     same_as_in_serial(work)
 
@@ -52,7 +52,7 @@ def test_adaptive_steps_on_a_closed_surface() -> None:
         problem = TimeProblem(F, u, udot, dt=0.01, petsc_options_prefix="a_", petsc_options=options)
         mass = fem.form(u * dx)
         before = comm.allreduce(fem.assemble_scalar(mass))
-        for _ in range(3):
+        for _ in range(2):
             problem.step()
         assert comm.allreduce(fem.assemble_scalar(mass)) == pytest.approx(before, abs=1e-12)
         return [whole(u), problem.time, problem.dt]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thccs_fem.extraction import Batch
+from thccs_fem.extraction import Batch, Cells
 from thccs_fem.facets import Facets, boundary_facets, interior_facets
 from thccs_fem.fem.forms import Form, Integral
 from thccs_fem.fem.space import CellwiseSpace
 from thccs_fem.fem.sparsity import pointer
 from thccs_fem.jit import library
-from thccs_fem.subdivision import Ints
+from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["Loop", "cell_loops", "loops"]
 
@@ -49,31 +49,39 @@ class Loop:
 
 
 def loops(form: Form) -> Iterator[Loop]:
-    """Yield the loops of all integrals of a form."""
-    data = _Data.of(form)
-    yield from _cell_loops(form, data)
-    yield from _facet_loops(form, data, "exterior_facet", boundary_facets)
-    yield from _facet_loops(form, data, "interior_facet", interior_facets)
+    """Yield the loops of all integrals of a form: over cells, and facets of cells, that count for what this rank owns.
+
+    These are its own cells where the form has no arguments, else those with a function that it owns.
+    """
+    cells, data = form.cells, _Data.of(form)
+    needed = cells.with_own_dofs if form.rank else _owned(cells)
+    yield from _cell_loops(form, data, needed)
+    yield from _facet_loops(form, data, needed, "exterior_facet", boundary_facets)
+    yield from _facet_loops(form, data, needed, "interior_facet", interior_facets)
 
 
 def cell_loops(form: Form) -> Iterator[Loop]:
-    """Yield the loops of the integrals over cells alone."""
-    yield from _cell_loops(form, _Data.of(form))
+    """Yield the loops of the integrals over cells alone, those that this rank owns."""
+    yield from _cell_loops(form, _Data.of(form), _owned(form.cells))
 
 
-def _cell_loops(form: Form, data: _Data) -> Iterator[Loop]:
+def _owned(cells: Cells) -> Bools:
+    return np.arange(cells.num_cells) < cells.num_owned
+
+
+def _cell_loops(form: Form, data: _Data, needed: Bools) -> Iterator[Loop]:
     integrals = [integral for integral in form.integrals if integral.kind == "cell"]
     first_piece = 0
     for batch in form.cells.batches if integrals else ():
         memory: list[Any] = []
         c_batch = _c_batch(batch, form.cells.points, memory)
-        for integral, chosen in _chosen(integrals, form.cells.tag[batch.cells]):
+        for integral, chosen in _chosen(integrals, form.cells.tag[batch.cells], needed[batch.cells]):
             c_integral = data.c_integral(integral, batch.cells.size, chosen, memory)
             yield Loop(batch, first_piece, batch.cells, c_batch, c_integral, memory)
         first_piece += batch.num_pieces
 
 
-def _facet_loops(form: Form, data: _Data, kind: str, facets_of: Callable[..., Facets]) -> Iterator[Loop]:
+def _facet_loops(form: Form, data: _Data, needed: Bools, kind: str, facets_of: Callable[..., Facets]) -> Iterator[Loop]:
     integrals = [integral for integral in form.integrals if integral.kind == kind]
     if not integrals:
         return
@@ -81,6 +89,7 @@ def _facet_loops(form: Form, data: _Data, kind: str, facets_of: Callable[..., Fa
     wanted = np.zeros(facets.num_facets, dtype=bool)
     for integral in integrals:
         wanted |= True if integral.tag is None else facets.tag == integral.tag
+    wanted &= needed[facets.facet_cells].any(axis=1)
     if kind == "exterior_facet":
         sets = facets.facet_cells[:, 0]
     else:
@@ -88,17 +97,18 @@ def _facet_loops(form: Form, data: _Data, kind: str, facets_of: Callable[..., Fa
     for part in facets.batches(np.flatnonzero(wanted).astype(np.int32)):
         memory: list[Any] = []
         c_batch = _c_batch(part.batch, part.points, memory)
-        for integral, chosen in _chosen(integrals, facets.tag[part.facets]):
+        every = np.ones(part.facets.size, dtype=bool)
+        for integral, chosen in _chosen(integrals, facets.tag[part.facets], every):
             c_integral = data.c_integral(integral, part.facets.size, chosen, memory)
             yield Loop(part.batch, 0, sets[part.facets], c_batch, c_integral, memory)
 
 
-def _chosen(integrals: list[Integral], tags: Ints) -> Iterator[tuple[Integral, Ints | None]]:
-    """Yield the integrals over a batch, and its cells or facets that each is over; None for all."""
+def _chosen(integrals: list[Integral], tags: Ints, needed: Bools) -> Iterator[tuple[Integral, Ints | None]]:
+    """Yield the integrals over a batch, and those needed of its cells or facets that each is over; None for all."""
     for integral in integrals:
-        chosen = None if integral.tag is None else np.flatnonzero(tags == integral.tag).astype(np.int32)
-        if chosen is None or chosen.size:
-            yield integral, chosen
+        marks = needed if integral.tag is None else needed & (tags == integral.tag)
+        if marks.any():
+            yield integral, None if marks.all() else np.flatnonzero(marks).astype(np.int32)
 
 
 def _c_batch(batch: Batch, points: Floats, memory: list[Any]) -> Any:

@@ -49,8 +49,8 @@ def product(A: sp.csr_array, index_map: IndexMap) -> Callable[[Floats], Floats]:
 def conjugate_gradients(apply: Callable[[Floats], Floats], diagonal: Floats, load: Floats, comm: Any) -> Floats:
     """Return the solutions of A x = b for a symmetric positive definite matrix; collective.
 
-    What is left of the residual is measured relative to the diagonal, by its largest entry: where cells are small so are
-    the entries of b, and a norm of the residual would say nothing of them.
+    What is left of the residual is measured relative to the diagonal, by its largest entry: where cells are small so
+    are the entries of b, and a norm of the residual would say nothing of them.
 
     Args:
         apply: Multiplies vectors by A, shape (n, k), in which each rank has the rows that it owns.

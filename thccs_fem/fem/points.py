@@ -21,9 +21,9 @@ def point_values(
     point i does the work F_i . v(x_i) on a test function v, so that forces F of shape (n, k) are the load
     ``(B.T @ F).ravel()``.
 
-    On several ranks, all of which give the same points, columns are local functions. Rows of points on cells that a rank
-    does not hold are zero, so that values are those of `Function.eval`; but a rank holds all cells of the functions
-    that it owns, so that its part of the load is complete.
+    On several ranks all give the same points, and columns are local functions. Rows of points on cells that a rank does
+    not hold are zero (`Function.eval` has all values); but it holds all cells of the functions that it owns, so that
+    this part of the load is complete.
 
     Args:
         V: The space; of one with vector values the scalar functions are meant.
@@ -32,8 +32,8 @@ def point_values(
         corner: Sub-quad of a polygon, shape (n,).
 
     Returns:
-        Shape (n, V.num_functions), or on several ranks as many columns as there are local functions; 16 entries a row in
-        regular cells of level 0.
+        Shape (n, V.num_functions), on several ranks with a column for each local function; 16 entries a row in regular
+        cells of level 0.
 
     Raises:
         TypeError: If faces or corners are no integers, or V is no space of splines.

@@ -178,8 +178,8 @@ class FunctionSpace(ufl.FunctionSpace):
     def prolongation(self, coarse: FunctionSpace) -> sp.csr_array:
         """Return the exact transfer from a coarser space, shape (num_dofs, coarse.num_dofs).
 
-        On several ranks it is the same on each, for the dofs of all of them by their numbers in the hierarchies, not for
-        local ones: `adapt.transfer` carries functions over.
+        On several ranks it is the same on each, for the dofs of all of them by their numbers in the hierarchies, not
+        for local ones: `adapt.transfer` carries functions over.
 
         Raises:
             ValueError: If the spaces are not nested or their values have different shapes.

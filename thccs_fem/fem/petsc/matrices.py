@@ -25,7 +25,9 @@ from thccs_fem.fem.forms import Form
 from thccs_fem.fem.layout import Layout, constraints
 from thccs_fem.fem.linear import constrain
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.sparsity import pointer
 from thccs_fem.index_map import IndexMap
+from thccs_fem.jit import library
 from thccs_fem.parallel import total
 from thccs_fem.subdivision import Ints
 
@@ -254,15 +256,32 @@ def sharing(A: sp.csr_array, comm: Any, columns: Numbering | None = None) -> PET
         mat = PETSc.Mat().createAIJWithArrays(A.shape, _csr(A.indptr, A.indices, A.data), comm=comm)
         mat.setAttr("values", A)
         return mat
-    is_own = A.indices < columns.num_owned
-    before = np.concatenate([[0], np.cumsum(is_own, dtype=np.int32)])[A.indptr]
-    own = _csr(before, A.indices[is_own], A.data[is_own])
-    others = _csr(A.indptr - before, columns.numbers[A.indices[~is_own]], A.data[~is_own])
+    own, others = _split(A, columns)
     size: Any = (A.shape[0], None), (columns.num_owned, None)  # None: whatever it is, other than the stubs say
     mat = PETSc.Mat().createAIJWithArrays(size, (own, others), comm=comm)
     mat.setAttr("values", A)
     mat.setAttr("parts", (columns.num_owned, own[2], others[2]))
     return mat
+
+
+def _split(A: sp.csr_array, columns: Numbering) -> tuple[Any, Any]:
+    """Return the entries of A in columns that this rank owns, and the others, by PETSc's numbers of the columns."""
+    num_others = int(np.count_nonzero(A.indices >= columns.num_owned))
+    sizes = A.indices.size - num_others, num_others
+    (own_indptr, own_indices), (other_indptr, other_indices) = (
+        (np.zeros(A.shape[0] + 1, dtype=np.int32), np.zeros(size, dtype=np.int32)) for size in sizes
+    )
+    numbers = columns.numbers[columns.num_owned :].astype(np.int32)
+    arrays = A.indptr, A.indices, numbers, own_indptr, own_indices, other_indptr, other_indices
+    library().lib.thccs_split_pattern(A.shape[0], columns.num_owned, *(pointer(array) for array in arrays))
+    own, others = (np.zeros(size) for size in sizes)
+    _split_values(A, columns.num_owned, own, others)
+    return _csr(own_indptr, own_indices, own), _csr(other_indptr, other_indices, others)
+
+
+def _split_values(A: sp.csr_array, num_owned: int, own: Floats, others: Floats) -> None:
+    arrays = A.indices, A.data, own, others
+    library().lib.thccs_split_values(A.indices.size, num_owned, *(pointer(array) for array in arrays))
 
 
 def _csr(indptr: Ints, indices: Ints, data: Floats) -> Any:  # sequences, say the stubs
@@ -284,9 +303,6 @@ def changed(mat: PETSc.Mat) -> None:
     parts: Any = mat.getAttr("parts")
     if parts is not None:
         A: Any = mat.getAttr("values")
-        num_owned, own, others = parts
-        is_own = A.indices < num_owned
-        np.compress(is_own, A.data, out=own)
-        np.compress(~is_own, A.data, out=others)
+        _split_values(A, *parts)
     mat.assemble()
     mat.stateIncrease()
