@@ -477,7 +477,7 @@ def test_matrix_of_other_spaces_is_not_refilled() -> None:
 @pytest.mark.parametrize(("length", "dtype"), [(256, np.uint8), (257, np.uint16)])
 def test_positions_in_the_longest_row_of_each_type(length: int, dtype: type) -> None:
     dofs = np.arange(length, dtype=np.int32)
-    pattern = sparsity._new_pattern(length, np.array([length], dtype=np.int32), dofs)
+    pattern = sparsity._new_pattern(length, length, np.array([length], dtype=np.int32), dofs)
     assert pattern.positions.dtype == dtype
     np.testing.assert_array_equal(pattern.positions.reshape(length, length), np.tile(dofs, (length, 1)))
 

@@ -184,7 +184,7 @@ def to_dofs(boundary: Boundary) -> sp.csr_array:
     q0 = boundary.first[v]
     c, x1, opposite, y1 = boundary.corner_faces.T
     q10 = boundary.first[c]
-    others = np.setdiff1d(np.arange(boundary.level.num_vertices, dtype=np.int32), boundary.vertex)
+    others = np.flatnonzero(boundary.first < 0)
     triplets: Triplets = [(others, others, 1.0), (v, v, 2 / 3), (v, w, 1 / 3), (q0, v, 1.0), (q0, q0, 1 / 6)]
     triplets += [(c, c, 4 / 9), (c, x1, 2 / 9), (c, y1, 2 / 9), (c, opposite, 1 / 9)]
     for row, delta, neighbour, side in (
@@ -223,9 +223,10 @@ def _points_from_dofs(boundary: Boundary) -> sp.csr_array:
     """Return the rows P of T; the rows of the traces are empty."""
     size = boundary.num_functions
     v, w = boundary.smooth_edges
-    across_free = np.isin(w, v)  # a strip one face wide: both of its rims are free
+    # In a strip one face wide both of the rims are free.
+    across_free = (boundary.first[w] >= 0) & ~boundary.level.corner[w]
     c = boundary.corner_faces[:, 0]
-    others = np.setdiff1d(np.arange(boundary.level.num_vertices, dtype=np.int32), boundary.vertex)
+    others = np.flatnonzero(boundary.first < 0)
     rims: Triplets = [
         (others, others, 1.0),
         (v, v, np.where(across_free, 2.0, 1.5)),
@@ -246,6 +247,8 @@ def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:
     The support of a smooth trace i are the faces of the rim edges i - 2 .. i + 2; of a corner's q10 and q01 those of
     the two edges along its rim; of q00 its one face.
     """
+    if not boundary.vertex.size:
+        return np.zeros(0, dtype=bool)
     level = boundary.level
     a, b, hit = _rim_edges(level, faces)
     reached = _one_edge_further(level, a, b, hit)
@@ -264,10 +267,13 @@ def traces_meeting(boundary: Boundary, faces: Bools) -> Bools:
 def support_of_traces(boundary: Boundary, traces: Bools) -> Bools:
     """Return the faces in the support of any of the marked trace functions, shape (num_faces,)."""
     level = boundary.level
+    if not traces.any():
+        return np.zeros(level.num_faces, dtype=bool)
     a, b, _ = _rim_edges(level, np.zeros(level.num_faces, dtype=bool))
     leaving, entering, of_face = (np.zeros(level.num_vertices, dtype=bool) for _ in range(3))
-    leaving[boundary.vertex[traces & np.isin(boundary.kind, (SMOOTH, CORNER_OUT))]] = True
-    entering[boundary.vertex[traces & np.isin(boundary.kind, (SMOOTH, CORNER_IN))]] = True
+    smooth = boundary.kind == SMOOTH
+    leaving[boundary.vertex[traces & (smooth | (boundary.kind == CORNER_OUT))]] = True
+    entering[boundary.vertex[traces & (smooth | (boundary.kind == CORNER_IN))]] = True
     of_face[boundary.vertex[traces & (boundary.kind == CORNER_MIXED)]] = True
     edges = _one_edge_further(level, a, b, leaving[a] | entering[b]) | of_face[a]
     faces = np.zeros(level.num_faces, dtype=bool)

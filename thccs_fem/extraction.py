@@ -165,8 +165,7 @@ class Cells:
             row.append(16 * mine[i] + j)
             column.append(dofs[i, k])
             value.append(operators[i, j, k])
-        entries = (np.concatenate(value), (np.concatenate(row), np.concatenate(column)))
-        return sp.csr_array(entries, shape=(16 * pieces.size, self.num_dofs))
+        return summed(list(zip(row, column, value, strict=True)), (16 * pieces.size, self.num_dofs))
 
     @cached_property
     def cell_dofs(self) -> tuple[Ints, Ints]:
@@ -513,7 +512,8 @@ def _general_batches(
     """Return batches of dense operators for the given pieces, which are sorted by cell, and their pieces."""
     if not pieces.size:
         return [], []
-    cells, first, count = (a.astype(np.int32) for a in np.unique(cell, return_index=True, return_counts=True))
+    first = np.flatnonzero(np.diff(cell, prepend=-1)).astype(np.int32)
+    cells, count = cell[first], np.diff(first, append=np.int32(pieces.size))
     rows = Rows(16 * np.append(first, np.int32(pieces.size)), nodes.ravel(), coefficients)
     offsets, dofs = rows.columns()
     size = np.diff(offsets)
@@ -532,7 +532,8 @@ def _general_batches(
         local_offsets = np.concatenate([[0], np.cumsum(count[chosen])]).astype(np.int32)
         mine = np.repeat(first[chosen] - local_offsets[:-1], count[chosen]) + np.arange(local_offsets[-1])
         padded = np.full((chosen.size, w), -1, dtype=np.int32)
-        padded[np.arange(w) < size[chosen, None]] = dofs[np.isin(np.repeat(np.arange(cells.size), size), chosen)]
+        used = np.arange(w) < size[chosen, None]
+        padded[used] = dofs[(offsets[chosen, None] + np.arange(w))[used]]
         begin = starts[chosen[0]]
         operators = values[begin : begin + 16 * mine.size * w].reshape(mine.size, 16, w)
         batches.append(Batch(cells[chosen], padded, local_offsets, nodes[mine], operators))
@@ -556,14 +557,12 @@ class Rows:
 
     def columns(self) -> tuple[Ints, Ints]:
         """Return offsets, shape (cells + 1,), and the ascending columns that occur in the rows of each cell."""
-        counts = np.zeros(self.offsets.size - 1, dtype=np.int32)
         seen = np.full(self.matrix.shape[1], -1, dtype=np.int32)
-        self.run("thccs_cell_columns", seen, counts, None, None)
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        columns = np.zeros(offsets[-1], dtype=np.int32)
-        seen[:] = -1
-        self.run("thccs_cell_columns", seen, counts, offsets, columns)
-        return offsets, columns
+        offsets = np.zeros(self.offsets.size, dtype=np.int32)
+        most = int(np.diff(self.matrix.indptr)[self.rows].sum(dtype=np.int64))
+        columns = np.zeros(most, dtype=np.int32)  # what is not used of it is not touched
+        self.run("thccs_cell_columns", seen, offsets, columns)
+        return offsets, columns[: offsets[-1]].copy()
 
     def run(self, function: str, *arrays: npt.NDArray[Any] | None) -> None:
         """Call a loop of kernels.c."""

@@ -442,7 +442,7 @@ def _stages(
     while True:
         before = known[level.number] if level.number < len(known) else None
         keys = refined_keys[level.number] if level.number < len(refined_keys) else np.zeros(0, dtype=np.int64)
-        refined = np.isin(level.keys, keys, assume_unique=True) & inside
+        refined = _with_keys(level, keys) & inside
         cut = held & ~refined & _needs_cut(level, caps)
         outline = _outline(level, inside, refined, cut, before)
         outlines.append(before if before is not None and outline.is_of(before) else outline)
@@ -524,6 +524,14 @@ def _steps(
     return result
 
 
+def _with_keys(level: Level, keys: Keys) -> Bools:
+    """Return marks of the faces that have one of the given keys."""
+    place = np.minimum(np.searchsorted(level.keys, keys), level.num_faces - 1)
+    marks = np.zeros(level.num_faces, dtype=bool)
+    marks[place[level.keys[place] == keys]] = True
+    return marks
+
+
 def _needs_cut(level: Level, caps: Ints) -> Bools:
     """Return the faces with an irregular corner whose cap level is not reached yet."""
     ends_later = ~level.regular
@@ -551,6 +559,8 @@ def functions_meeting(boundary: Boundary, faces: Bools) -> Bools:
 def faces_meeting(boundary: Boundary, functions: Bools) -> Bools:
     """Return the faces in the union of the supports of the marked functions, shape (num_faces,)."""
     level = boundary.level
+    if not functions.any():
+        return np.zeros(level.num_faces, dtype=bool)
     vertices, traces = np.split(functions, [level.num_vertices])
     return neighbourhood(level, level.touching(vertices)) | support_of_traces(boundary, traces)
 

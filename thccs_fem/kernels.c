@@ -606,23 +606,19 @@ static int ascending(const void *a, const void *b)
 }
 
 void thccs_cell_columns(int32_t num_cells, const int32_t *cell_rows, const int32_t *rows, const int32_t *indptr,
-                        const int32_t *indices, int32_t *seen, int32_t *counts, const int32_t *offsets,
-                        int32_t *columns)
+                        const int32_t *indices, int32_t *seen, int32_t *offsets, int32_t *columns)
 {
+  int32_t end = 0;
   for (int32_t c = 0; c < num_cells; ++c) {
-    int32_t count = 0;
+    const int32_t first = end;
     for (int32_t r = cell_rows[c]; r < cell_rows[c + 1]; ++r)
       for (int32_t k = indptr[rows[r]]; k < indptr[rows[r] + 1]; ++k)
         if (seen[indices[k]] != c) {
           seen[indices[k]] = c;
-          if (columns)
-            columns[offsets[c] + count] = indices[k];
-          ++count;
+          columns[end++] = indices[k];
         }
-    if (columns)
-      qsort(columns + offsets[c], count, sizeof *columns, ascending);
-    else
-      counts[c] = count;
+    qsort(columns + first, end - first, sizeof *columns, ascending);
+    offsets[c + 1] = end;
   }
 }
 

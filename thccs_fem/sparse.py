@@ -22,12 +22,16 @@ Floats = npt.NDArray[np.float64]
 Triplets = list[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer], Floats | float]]
 
 COMPUTED, EMPTY = -1, -2  # what `product` has in a row that is no unit row
+_EMPTY = sp.csr_array((0, 0))
 
 
 def csr(data: Floats, indices: Ints, indptr: Ints, shape: tuple[int, int]) -> sp.csr_array:
-    """Return the matrix of arrays that are known to be right, which are neither looked at nor copied."""
-    matrix = sp.csr_array(shape)
-    matrix.data, matrix.indices, matrix.indptr = data, indices, indptr
+    """Return the matrix of arrays that are known to be right, which are neither looked at nor copied.
+
+    SciPy's constructor takes longer than most of the loops here.
+    """
+    matrix: sp.csr_array = object.__new__(sp.csr_array)
+    matrix.__dict__.update(_EMPTY.__dict__, data=data, indices=indices, indptr=indptr, _shape=shape)
     return matrix
 
 
@@ -58,8 +62,7 @@ def product(a: sp.csr_array, b: sp.csr_array, unit: Ints | None = None) -> sp.cs
     indptr = np.zeros(a.shape[0] + 1, dtype=np.int32)
     indices, data = np.zeros(bound, dtype=np.int32), np.zeros(bound)
     place = np.full(b.shape[1], -1, dtype=np.int32)
-    factors = (a.indptr, a.indices, a.data, b.indptr, b.indices, b.data)
-    _run("thccs_product", a.shape[0], *factors, unit, place, indptr, indices, data)
+    _run("thccs_product", a.shape[0], *_arrays(a), *_arrays(b), unit, place, indptr, indices, data)
     return csr(*_trimmed(data, indices, indptr), (a.shape[0], b.shape[1]))
 
 
@@ -74,27 +77,29 @@ def rows_of(a: sp.csr_array, rows: npt.NDArray[np.integer]) -> sp.csr_array:
     np.cumsum(np.diff(a.indptr)[rows], out=indptr[1:])
     indices, data = np.zeros(indptr[-1], dtype=np.int32), np.zeros(indptr[-1])
     rows = rows.astype(np.int32, copy=False)
-    _run("thccs_rows", rows.size, rows, a.indptr, a.indices, a.data, indptr, indices, data)
+    _run("thccs_rows", rows.size, rows, *_arrays(a), indptr, indices, data)
     return csr(data, indices, indptr, (rows.size, a.shape[1]))
 
 
 def first_rows(a: sp.csr_array, count: int) -> sp.csr_array:
     """Return the first rows."""
-    nnz = a.indptr[count]
-    return csr(a.data[:nnz], a.indices[:nnz], a.indptr[: count + 1], (count, a.shape[1]))
+    indptr, indices, data = _arrays(a)
+    return csr(data[: indptr[count]], indices[: indptr[count]], indptr[: count + 1], (count, a.shape[1]))
 
 
 def stacked(matrices: Sequence[sp.csr_array]) -> sp.csr_array:
     """Return matrices with equally many columns, one below the other."""
     if len(matrices) == 1:
         return matrices[0]
-    ends = np.cumsum([m.nnz for m in matrices])
-    indptr = np.concatenate(
-        [[0], *(m.indptr[1:] + np.int32(end - m.indptr[-1]) for m, end in zip(matrices, ends, strict=True))],
-        dtype=np.int32,
-    )
-    data, indices = np.concatenate([m.data for m in matrices]), np.concatenate([m.indices for m in matrices])
-    return csr(data, indices, indptr, (indptr.size - 1, matrices[0].shape[1]))
+    indptrs, indices, data = zip(*(_arrays(m) for m in matrices), strict=True)
+    begins = np.cumsum([0, *(m.size for m in data[:-1])], dtype=np.int32)
+    indptr = np.concatenate([[0], *(m[1:] + begin for m, begin in zip(indptrs, begins, strict=True))], dtype=np.int32)
+    return csr(np.concatenate(data), np.concatenate(indices), indptr, (indptr.size - 1, matrices[0].shape[1]))
+
+
+def _arrays(a: sp.csr_array) -> tuple[Ints, Ints, Floats]:
+    """Return the arrays of a matrix that may be one of SciPy's, which chooses the type of its indices."""
+    return a.indptr.astype(np.int32, copy=False), a.indices.astype(np.int32, copy=False), a.data
 
 
 def _trimmed(data: Floats, indices: Ints, indptr: Ints) -> tuple[Floats, Ints, Ints]:
@@ -107,7 +112,7 @@ def _run(function: str, *arguments: int | npt.NDArray[Any] | None) -> None:
     """Call a loop of kernels.c."""
     module = jit.library()
     pointer, null = module.ffi.from_buffer, module.ffi.NULL
-    c_types = {"i": "int32_t[]", "f": "double[]"}
+    c_types = {"i4": "int32_t[]", "f8": "double[]"}
     getattr(module.lib, function)(
-        *(null if a is None else a if isinstance(a, int) else pointer(c_types[a.dtype.kind], a) for a in arguments)
+        *(null if a is None else a if isinstance(a, int) else pointer(c_types[a.dtype.str[1:]], a) for a in arguments)
     )
