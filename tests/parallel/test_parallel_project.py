@@ -13,6 +13,7 @@ from zoo import ZOO
 
 import ufl
 from thccs_fem import adapt, fem, generators
+from thccs_fem.fem import mass
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.parallel import gathered
@@ -51,8 +52,12 @@ def whole(u: fem.Function) -> Floats:
     return u.x.index_map.gather(u.x.array.reshape(-1, u.x.block_size))
 
 
-@SEVERAL
-def test_projections(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "small"), [*((name, mass.SMALL) for name in MESHES), ("wheel5", 0)], ids=[*MESHES, "wheel5, iterated"]
+)
+def test_projections(name: str, small: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mass, "SMALL", small)
+
     def projected(comm: MPI.Comm) -> list[Floats]:
         V = space(comm, name)
         x, on_cells = ufl.SpatialCoordinate(V.mesh), some_function(fem.cellwise(V))

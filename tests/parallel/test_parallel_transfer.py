@@ -14,6 +14,7 @@ from zoo import ZOO
 
 import ufl
 from thccs_fem import adapt, fem, generators
+from thccs_fem.fem import mass
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import total
 from thccs_fem.partition import partition
@@ -27,7 +28,7 @@ MESHES: dict[str, Callable[[], Any]] = {
     "tube": lambda: generators.torus((24, 4)),  # long enough that no rank holds all of it
 }
 SEVERAL = pytest.mark.parametrize("name", MESHES)
-TOLERANCE = 1e-11  # residuals of 1e-14, condition numbers of some hundred; in serial matrices are factorised
+TOLERANCE = 1e-11  # if iterated, residuals of 1e-14, condition numbers of some hundred; else matrices are factorised
 
 
 def coarsest(comm: MPI.Comm, name: str, shape: tuple[int, ...] = ()) -> FunctionSpace:
@@ -77,9 +78,13 @@ def test_into_refinements_it_is_exact(name: str) -> None:
     same_as_in_serial(carried, tol=1e-13)
 
 
-@SEVERAL
+@pytest.mark.parametrize(
+    ("name", "small"), [*((name, mass.SMALL) for name in MESHES), ("wheel5", 0)], ids=[*MESHES, "wheel5, iterated"]
+)
 @pytest.mark.parametrize("norm", ["L2", "H1"])
-def test_to_coarser_and_to_other_hierarchies(norm: Any, name: str) -> None:
+def test_to_coarser_and_to_other_hierarchies(norm: Any, name: str, small: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mass, "SMALL", small)
+
     def carried(comm: MPI.Comm) -> list[Floats]:
         V = coarsest(comm, name)
         U, W = refined(V, seed=1), refined(V, seed=2)

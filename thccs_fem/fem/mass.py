@@ -1,7 +1,8 @@
 """Equations with mass matrices, solved by conjugate gradients over the ranks.
 
 Scaled by its diagonal a mass matrix is well conditioned, whatever the mesh and the refinement, so that nothing else is
-needed.
+needed. Where spaces are small each rank has the whole matrix, since it solves faster than it hears of others some
+hundred times.
 """
 
 from __future__ import annotations
@@ -16,12 +17,58 @@ import scipy.sparse as sp
 from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import gathered, total
 
-__all__ = ["conjugate_gradients", "product"]
+__all__ = ["conjugate_gradients", "is_small", "product", "solved", "whole"]
 
+Ints = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float64]
 
+SMALL = 20_000  # functions of a space whose matrix each rank has the whole of: some ten megabytes
 TOLERANCE = 1e-14  # errors are some hundred times as large, up to 2e-12 of the values
 MOST_ITERATIONS = 10_000  # 200 to 400 are enough on any mesh and refinement, for the H1 product the diameter over h
+
+
+def is_small(index_map: IndexMap) -> bool:
+    """Return whether each rank has the whole of a matrix for these functions."""
+    return index_map.is_whole or index_map.size_global <= SMALL
+
+
+def solved(M: sp.csr_array, load: Floats, index_map: IndexMap) -> Floats:
+    """Return the solutions of M x = b for a mass matrix; collective.
+
+    Args:
+        M: Owned rows, local columns.
+        load: Vectors b, owned part, shape (size_local, k).
+        index_map: What this rank owns and holds.
+
+    Returns:
+        Owned part, shape (size_local, k).
+
+    Raises:
+        RuntimeError: It does not converge.
+    """
+    if index_map.is_whole or not is_small(index_map):
+        return conjugate_gradients(product(M, index_map), M.diagonal(), load, index_map.comm)
+    owned = index_map.numbers[: index_map.size_local]
+    M = whole(M, owned, index_map.numbers, index_map)
+    return conjugate_gradients(M.__matmul__, M.diagonal(), index_map.gather(load), None)[owned]
+
+
+def whole(A: sp.csr_array, rows: Ints, columns: Ints, index_map: IndexMap) -> sp.csr_array:
+    """Return the sum of the matrices of all ranks, on each of them the same; collective.
+
+    Args:
+        A: That of this rank.
+        rows: Numbers of its rows, shape (n,).
+        columns: Numbers of its columns, shape (m,).
+        index_map: That of rows and columns.
+
+    Returns:
+        Shape (size_global, size_global).
+    """
+    entries = sp.coo_array(A)
+    row, column = (gathered(index_map.comm, numbers) for numbers in (rows[entries.row], columns[entries.col]))
+    size = index_map.size_global
+    return sp.csr_array((gathered(index_map.comm, entries.data), (row, column)), shape=(size, size))
 
 
 def product(A: sp.csr_array, index_map: IndexMap) -> Callable[[Floats], Floats]:

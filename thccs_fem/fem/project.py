@@ -18,7 +18,7 @@ from thccs_fem.fem.assembly import assemble_cells, assemble_matrix, assemble_vec
 from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.forms import form
 from thccs_fem.fem.function import Constant, Function
-from thccs_fem.fem.mass import conjugate_gradients, product
+from thccs_fem.fem.mass import conjugate_gradients, is_small, solved, whole
 from thccs_fem.fem.scipy.linear import solver
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
@@ -64,9 +64,8 @@ def project(value: ValueOrExpression, V: FunctionSpace | CellwiseSpace) -> Funct
     mass = assemble_matrix(
         form(ufl.inner(ufl.TrialFunction(scalar), ufl.TestFunction(scalar)) * ufl.dx, quadrature_degree=DEGREE)
     )
-    found = conjugate_gradients(product(mass, V.index_map), mass.diagonal(), owned, V.mesh.comm)
     result = Function(V)
-    result.x.array[: V.num_owned_dofs] = found.ravel()
+    result.x.array[: V.num_owned_dofs] = solved(mass, owned, V.index_map).ravel()
     result.x.scatter_forward()
     return result
 
@@ -78,8 +77,8 @@ class Projection:
     the source, P^T G P x = P^T G Q u. Constants lie in all three spaces, so that either norm keeps the integral of u
     (over these cells). What the solver leaves of the residual against constants, a constant takes away.
 
-    Making one is collective, and so is its use. On several ranks, which have different parts of the three spaces,
-    P^T G P is not made but applied.
+    Making one is collective, and so is its use. Where spaces on several ranks, which have different parts of the three,
+    are large, P^T G P is not made but applied.
 
     Args:
         common: Scalar space that refines both.
@@ -96,7 +95,7 @@ class Projection:
         self._comm, self._functions = common.mesh.comm, FunctionSpace(target).index_map
         self._gram = assemble_matrix(form(inner * ufl.dx, quadrature_degree=DEGREE))
         self._from_target, self._from_source = (Prolongation(common.hierarchy, coarse) for coarse in (target, source))
-        self._solve = self._factorised() if self._functions.is_whole else self._iterated(self._diagonal())
+        self._solve = self._factorised() if is_small(self._functions) else self._iterated(self._diagonal())
         self._area = total(self._comm, self._applied(np.ones((self._functions.numbers.size, 1))).sum())
 
     def __call__(self, values: Floats) -> Floats:
@@ -118,10 +117,19 @@ class Projection:
         return self._tested(self._from_target(x))
 
     def _factorised(self) -> Callable[[Floats], Floats]:
-        P = self._from_target.matrix
-        return solver(sp.csr_array(sp.csr_array(P.T @ self._gram) @ P), TOLERANCE)
+        """Return what solves the equations by the whole matrix, on each rank."""
+        P, wanted, functions = self._from_target.matrix, self._from_target.wanted, self._functions
+        matrix = sp.csr_array(sp.csr_array(P[: self._gram.shape[0]].T @ self._gram) @ P)
+        if functions.is_whole:
+            return solver(matrix, TOLERANCE)
+        solve, owned = (
+            solver(whole(matrix, wanted, wanted, functions), TOLERANCE),
+            functions.numbers[: functions.size_local],
+        )
+        return lambda load: solve(functions.gather(load))[owned]
 
     def _iterated(self, diagonal: Floats) -> Callable[[Floats], Floats]:
+        """Return what solves them by applying it."""
         return lambda load: conjugate_gradients(self._applied, diagonal, load, self._comm)
 
     def _diagonal(self) -> Floats:
