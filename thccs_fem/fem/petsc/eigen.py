@@ -19,7 +19,7 @@ from thccs_fem.fem.forms import Form
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.linear import check_regular
 from thccs_fem.fem.petsc.linear import factorises, solved
-from thccs_fem.fem.petsc.matrices import comm_of, new_vec, sharing
+from thccs_fem.fem.petsc.matrices import new_vec, sharing, solver_comm
 from thccs_fem.fem.petsc.options import Options
 
 __all__ = ["EigenProblem"]
@@ -75,7 +75,7 @@ class EigenProblem:
         self._options = Options(petsc_options_prefix, petsc_options)
         self._system = EigenSystem(a, m, bcs=bcs, num_eigenvalues=num_eigenvalues, target=target)
         self.bcs = bcs
-        self._comm = comm_of(self._system.a.spaces[0])
+        self._comm = solver_comm(self._system.a.spaces[0])
         self._solver = SLEPc.EPS().create(self._comm)
         self._solver.setOptionsPrefix(petsc_options_prefix)
         self._solver.setProblemType(SLEPc.EPS.ProblemType.GHEP)

@@ -27,7 +27,7 @@ from thccs_fem.fem.linear import (
     is_symmetric,
     norm,
 )
-from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec
+from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec, solver_comm
 from thccs_fem.fem.petsc.multigrid import has_coarse_level, multigrid
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
@@ -111,7 +111,7 @@ class LinearProblem:
         self.bcs = bcs
         self.load = load
         self._kind = kind
-        self._comm = comm_of(self._system.layout.spaces[0])
+        self._comm = solver_comm(self._system.layout.spaces[0])
         self._solver = PETSc.KSP().create(self._comm)
         self._solver.setOptionsPrefix(petsc_options_prefix)
         self._solver.setTolerances(rtol=TOLERANCE)

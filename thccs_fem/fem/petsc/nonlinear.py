@@ -20,7 +20,7 @@ from thccs_fem.fem.layout import Conditions
 from thccs_fem.fem.linear import check_regular, is_finite, is_fourth_order
 from thccs_fem.fem.nonlinear import MAX_ITERATIONS, RELATIVE, STEP, NonlinearSystem
 from thccs_fem.fem.petsc import linear
-from thccs_fem.fem.petsc.matrices import changed, comm_of, new_block_mat, new_vec
+from thccs_fem.fem.petsc.matrices import changed, new_block_mat, new_vec, solver_comm
 from thccs_fem.fem.petsc.options import Options
 
 __all__ = ["NonlinearProblem"]
@@ -92,7 +92,7 @@ class NonlinearProblem:
         self.norms: list[float] = []
         self._kind = kind
         layout = self._system.layout
-        self._comm = comm_of(layout.spaces[0])
+        self._comm = solver_comm(layout.spaces[0])
         self._b = np.zeros(layout.num_owned)
         self._solver = PETSc.SNES().create(self._comm)
         self._solver.setOptionsPrefix(petsc_options_prefix)

@@ -24,7 +24,7 @@ from thccs_fem.fem.linear import is_finite, is_fourth_order
 from thccs_fem.fem.nonlinear import RELATIVE
 from thccs_fem.fem.petsc import linear, nonlinear
 from thccs_fem.fem.petsc.evolution import Conditions, EvolutionEquations, values_of
-from thccs_fem.fem.petsc.matrices import comm_of, new_vec
+from thccs_fem.fem.petsc.matrices import new_vec, solver_comm
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import total
@@ -273,7 +273,7 @@ class TimeProblem:
 
     def _stepper(self, time: float, number: int, dt: float) -> PETSc.TS:
         """Return a TS that goes on from u as if it had made the step before itself."""
-        ts = PETSc.TS().create(comm_of(self.u.function_space))
+        ts = PETSc.TS().create(solver_comm(self.u.function_space))
         ts.setOptionsPrefix(self._options.prefix)
         ts.setType(TYPES[self._scheme])
         ts.setErrorIfStepFails(False)
