@@ -83,6 +83,16 @@ def test_remeshed_hierarchies_have_the_bits_of_those_made_anew(case, seeds, cap)
     check_same(everything(hierarchy.with_caps_at(cap + 2)), everything(deeper))
 
 
+def test_a_refined_part_that_moves_takes_nothing_over():
+    mesh = generators.torus((16, 8))  # where all places look alike: parts have equally many faces everywhere
+    hierarchy = Hierarchy.on(mesh).refined(np.array([0]))
+    num_cells = sum(stage.active_faces.size for stage in hierarchy.stages)
+    moved = hierarchy.remeshed(hierarchy.dof_offsets[[1]] - 1, np.arange(num_cells))
+    assert [stage.level.num_faces for stage in moved.stages] == [stage.level.num_faces for stage in hierarchy.stages]
+    assert not np.array_equal(moved.refined_keys[0], hierarchy.refined_keys[0])
+    check_same(everything(moved), everything(Hierarchy.on(mesh, refined_keys=moved.refined_keys)))
+
+
 @pytest.mark.parametrize(("name", "rule"), CASES)
 def test_levels_may_be_joined_or_not(name, rule, monkeypatch):
     hierarchy = remeshed(remeshed(Hierarchy.on(MESHES[name], rule), 1), 2)

@@ -130,5 +130,7 @@ def _matrix(coarse: Level, level: Level, children: Ints, rule: BoundaryRule) -> 
     before, after, own = (Boundary.of(of, rule) for of in (coarse, step.fine, level))
     nth = np.arange(after.vertex.size) + level.num_vertices - after.first[after.vertex]
     functions = np.concatenate([vertex, own.first[vertex[after.vertex]] + nth])
-    matrix = product(product(to_dofs(after), subdivision_matrix(before, after, step)), before.to_points)
+    matrix = step.matrix
+    if before.vertex.size or after.vertex.size:
+        matrix = product(product(to_dofs(after), subdivision_matrix(before, after, step)), before.to_points)
     return rows_of(matrix, np.argsort(functions))

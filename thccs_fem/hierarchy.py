@@ -15,6 +15,9 @@ Dofs are numbered level by level, within a level vertices first, then traces, ea
 Faces with an irregular vertex that are not refined are cut by the same subdivision, down to one absolute level for each
 extraordinary vertex (`cap_levels`), where a bicubic cap ends the cut.  Cut faces ride along in the levels: functions
 outside of Omega^{l+1} keep their untruncated rows in C_{l+1}, so the same matrices give the pieces of cut faces.
+
+What is refined or coarsened shares all stages in which nothing changes with the hierarchy that it comes from.  Others
+are made together (`joined`), so that work grows with what changes and not with the number of levels.
 """
 
 from __future__ import annotations
@@ -433,8 +436,10 @@ def _stages(
 ) -> list[Stage]:
     """Return the stages from level 0 to that of the deepest piece.
 
-    Which faces a level has determines all of it, whatever coarser levels hold beside them; and a stage is determined by
-    its level and the marks on it. Both are taken over where they are `known`, from a hierarchy of this root and rule.
+    Which faces a level has determines all of it, whatever coarser levels hold beside them: its vertices stand in the
+    order of coarser vertices, edges and faces, and all faces at an edge that matters are there, being neighbours of one
+    that was opened. And a stage is determined by its level and the marks on it. Both are taken over where they are
+    `known`, from a hierarchy of this root and rule.
     """
     outlines: list[_Outline | Stage] = []
     level, inside = root, np.ones(root.num_faces, dtype=bool)

@@ -732,6 +732,33 @@ void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, 
   }
 }
 
+void thccs_restrict(int32_t num_rows, const int32_t *rows, const int32_t *place, const int32_t *a_indptr,
+                    const int32_t *a_indices, const double *a_data, int32_t *indptr, int32_t *indices, double *data)
+{
+  int32_t size = 0;
+  indptr[0] = 0;
+  for (int32_t i = 0; i < num_rows; ++i) {
+    for (int32_t k = a_indptr[rows[i]]; k < a_indptr[rows[i] + 1]; ++k) {
+      const int32_t column = place[a_indices[k]];
+      if (column >= 0) {
+        indices[size] = column;
+        data[size++] = a_data[k];
+      }
+    }
+    indptr[i + 1] = size;
+  }
+}
+
+void thccs_absolute_sums(int32_t num_rows, const int32_t *indptr, const int32_t *indices, const double *data,
+                         double *of_rows, double *of_columns)
+{
+  for (int32_t i = 0; i < num_rows; ++i)
+    for (int32_t k = indptr[i]; k < indptr[i + 1]; ++k) {
+      of_rows[i] += fabs(data[k]);
+      of_columns[indices[k]] += fabs(data[k]);
+    }
+}
+
 void thccs_split_pattern(int32_t num_rows, int32_t num_owned, const int32_t *indptr, const int32_t *indices,
                          const int32_t *numbers, int32_t *own_indptr, int32_t *own_indices, int32_t *other_indptr,
                          int32_t *other_indices)

@@ -121,6 +121,15 @@ void thccs_product(int32_t num_rows, const int32_t *a_indptr, const int32_t *a_i
 void thccs_rows(int32_t num_rows, const int32_t *rows, const int32_t *a_indptr, const int32_t *a_indices,
                 const double *a_data, const int32_t *indptr, int32_t *indices, double *data);
 
+/* Rows of a CSR matrix, columns by their place; those whose place is negative are left out. indptr (num_rows + 1),
+   indices and data are those of the result; these two have a place for each entry of the rows. */
+void thccs_restrict(int32_t num_rows, const int32_t *rows, const int32_t *place, const int32_t *a_indptr,
+                    const int32_t *a_indices, const double *a_data, int32_t *indptr, int32_t *indices, double *data);
+
+/* Sums of absolute values of the rows and columns of a CSR matrix, which are 0 before. */
+void thccs_absolute_sums(int32_t num_rows, const int32_t *indptr, const int32_t *indices, const double *data,
+                         double *of_rows, double *of_columns);
+
 /* Where the entries of a CSR matrix go that is split into its first num_owned columns, own, and the others, whose
    columns become numbers[column - num_owned]. own_indptr and other_indptr have num_rows + 1 places. */
 void thccs_split_pattern(int32_t num_rows, int32_t num_owned, const int32_t *indptr, const int32_t *indices,

@@ -15,7 +15,20 @@ import scipy.sparse as sp
 
 from thccs_fem import jit
 
-__all__ = ["COMPUTED", "EMPTY", "Triplets", "csr", "entries", "first_rows", "product", "rows_of", "stacked", "summed"]
+__all__ = [
+    "COMPUTED",
+    "EMPTY",
+    "Triplets",
+    "absolute_sums",
+    "csr",
+    "entries",
+    "first_rows",
+    "product",
+    "restricted",
+    "rows_of",
+    "stacked",
+    "summed",
+]
 
 Ints = npt.NDArray[np.int32]
 Floats = npt.NDArray[np.float64]
@@ -79,6 +92,30 @@ def rows_of(a: sp.csr_array, rows: npt.NDArray[np.integer]) -> sp.csr_array:
     rows = rows.astype(np.int32, copy=False)
     _run("thccs_rows", rows.size, rows, *_arrays(a), indptr, indices, data)
     return csr(data, indices, indptr, (rows.size, a.shape[1]))
+
+
+def restricted(a: sp.csr_array, rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer]) -> sp.csr_array:
+    """Return the part of a matrix in the given rows and columns, in their order.
+
+    Args:
+        a: Shape (m, n).
+        rows: Any rows.
+        columns: Different columns. Entries of a row stay in the order that they had in a.
+    """
+    rows, place = rows.astype(np.int32, copy=False), np.full(a.shape[1], -1, dtype=np.int32)
+    place[columns] = np.arange(columns.size, dtype=np.int32)
+    bound = int(np.diff(a.indptr)[rows].sum(dtype=np.int64))
+    indptr = np.zeros(rows.size + 1, dtype=np.int32)
+    indices, data = np.zeros(bound, dtype=np.int32), np.zeros(bound)  # memory that is not used is never touched
+    _run("thccs_restrict", rows.size, rows, place, *_arrays(a), indptr, indices, data)
+    return csr(data[: indptr[-1]], indices[: indptr[-1]], indptr, (rows.size, columns.size))
+
+
+def absolute_sums(a: sp.csr_array) -> tuple[Floats, Floats]:
+    """Return the sums of the absolute values in each row and in each column."""
+    of_rows, of_columns = np.zeros(a.shape[0]), np.zeros(a.shape[1])
+    _run("thccs_absolute_sums", a.shape[0], *_arrays(a), of_rows, of_columns)
+    return of_rows, of_columns
 
 
 def first_rows(a: sp.csr_array, count: int) -> sp.csr_array:

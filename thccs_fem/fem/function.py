@@ -55,7 +55,9 @@ class Vector:
         """Coefficients of each index of the map."""
         return self._block_size
 
-    petsc_vec = Absent("PETSc.Vec().createWithArray(u.x.array[: V.num_owned_dofs], comm=...) is one that shares the values")
+    petsc_vec = Absent(
+        "PETSc.Vec().createWithArray(u.x.array[: V.num_owned_dofs], comm=...) is one that shares the values"
+    )
 
     def scatter_forward(self) -> None:
         """Give ghosts the values that their owners have; collective."""

@@ -21,17 +21,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from thccs_fem.boundary import traces_meeting
+from thccs_fem.boundary import BoundaryRule, traces_meeting
 from thccs_fem.coarsening import coarsened
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.index_map import IndexMap
-from thccs_fem.subdivision import Bools, Ints, neighbourhood
+from thccs_fem.parallel import rank_of
+from thccs_fem.sparse import entries, rows_of, summed
+from thccs_fem.subdivision import Bools, Ints, Level, neighbourhood
 
 __all__ = ["LevelMatrix", "Levels", "owners_of", "prolongations_below"]
 
@@ -70,9 +73,9 @@ class LevelMatrix:
         """Entry on the diagonal of each row."""
         if self.dofs.is_whole:
             return self.values.diagonal()
-        rows = self.rows
-        on = self.values.indices == self.owned[rows]
-        return np.bincount(rows[on], self.values.data[on], minlength=self.owned.size)
+        on = np.flatnonzero(self.values.indices == np.repeat(self.owned, np.diff(self.values.indptr)))
+        rows = np.searchsorted(self.values.indptr, on, side="right") - 1
+        return np.bincount(rows, self.values.data[on], minlength=self.owned.size)
 
     def owned_rows(self, P: sp.csr_array) -> sp.csr_array:
         """Return the rows of a prolongation for the dofs that this rank owns."""
@@ -96,10 +99,10 @@ def _sent_to_owners(A: sp.csr_array, dofs: IndexMap) -> sp.csr_array:
     if dofs.is_whole:
         return A
     in_order = np.argsort(owners_of(dofs), kind="stable")
-    parts = [sp.coo_array(A[in_order[a:b]]) for a, b in pairwise(dofs.starts)]
-    sent = [(*part.coords, part.data) for part in parts]
-    rows, columns, values = (np.concatenate(arrays) for arrays in zip(*dofs.comm.alltoall(sent), strict=True))
-    return sp.csr_array((values, (rows, columns)), shape=(dofs.size_local, A.shape[1]))
+    sent = [entries(rows_of(A, in_order[a:b])) for a, b in pairwise(dofs.starts)]
+    rank = rank_of(dofs.comm)
+    own, sent[rank] = sent[rank], NOTHING
+    return summed([own, *dofs.comm.alltoall(sent)], (dofs.size_local, A.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,9 +196,9 @@ def _keep(A: LevelMatrix, number: Ints, level_of: Levelwise, kept: Sequence[list
     level = np.maximum(level_of[rows], level_of[columns])
     order = np.argsort(level, kind="stable")  # by radix, as these are bytes
     ends = np.cumsum(np.bincount(level, minlength=len(kept)))
-    for entries, of_level in zip(np.split(order, ends[:-1]), kept, strict=True):
-        if entries.size:
-            of_level.append((rows[entries], columns[entries], A.values.data[entries]))
+    for chosen, of_level in zip(np.split(order, ends[:-1]), kept, strict=True):
+        if chosen.size:
+            of_level.append((rows[chosen], columns[chosen], A.values.data[chosen]))
 
 
 def _spread(V: FunctionSpace, prolongations: Sequence[sp.csr_array]) -> tuple[IndexMap, ...]:
@@ -223,8 +226,9 @@ def _owned(comm: Any, owners: Ints) -> IndexMap:
 def _most_like(P: sp.csr_array) -> Ints:
     """Return for each column the row of its largest entry, the first of them."""
     columns = sp.csc_array(P)
-    order = np.lexsort((-columns.data, np.repeat(np.arange(P.shape[1]), np.diff(columns.indptr))))
-    return columns.indices[order[columns.indptr[:-1]]]
+    largest = np.maximum.reduceat(columns.data, columns.indptr[:-1])
+    found = np.flatnonzero(columns.data == np.repeat(largest, np.diff(columns.indptr)))
+    return columns.indices[found[np.searchsorted(found, columns.indptr[:-1])]]
 
 
 def _numbers(prolongations: Sequence[sp.csr_array], size: int) -> tuple[list[Ints], int]:
@@ -252,14 +256,19 @@ def _copies(P: sp.csr_array) -> Bools:
 
 
 def prolongations_below(hierarchy: Hierarchy) -> list[sp.csr_array]:
-    """Return the prolongations from coarser meshes up to level 0, until one has few functions."""
-    prolongations: list[sp.csr_array] = []
-    level, size = hierarchy.root, hierarchy.stages[0].boundary.num_functions
-    while size > SMALL and (found := coarsened(level, hierarchy.rule)) is not None:
-        level, matrix = found
-        prolongations.insert(0, _without_rounding(matrix))
-        size = matrix.shape[1]
-    return prolongations
+    """Return the prolongations from coarser meshes up to level 0, until one has few functions; once for a mesh."""
+    known = _below.setdefault(hierarchy.root, {})
+    if hierarchy.rule not in known:
+        known[hierarchy.rule] = []
+        level, size = hierarchy.root, hierarchy.stages[0].boundary.num_functions
+        while size > SMALL and (found := coarsened(level, hierarchy.rule)) is not None:
+            level, matrix = found
+            known[hierarchy.rule].insert(0, _without_rounding(matrix))
+            size = matrix.shape[1]
+    return list(known[hierarchy.rule])
+
+
+_below: WeakKeyDictionary[Level, dict[BoundaryRule, list[sp.csr_array]]] = WeakKeyDictionary()  # by level 0
 
 
 def _coefficients(V: FunctionSpace) -> Sequence[sp.csr_array]:

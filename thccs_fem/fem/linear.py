@@ -30,6 +30,7 @@ from thccs_fem.fem.function import Function
 from thccs_fem.fem.layout import Conditions, Layout, constraints
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import gathered, largest, rank_of, smallest, together, total
+from thccs_fem.sparse import absolute_sums
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = [
@@ -323,7 +324,8 @@ def unfixed_constants(A: sp.csr_array, layout: Layout, tolerance: Floats, dofs: 
         return None
     ones = (component[:, None] == np.arange(k)).astype(np.float64)
     n = layout.num_owned
-    size = np.stack([abs(A) @ np.ones(A.shape[1]), layout.without_ghosts(abs(A).T @ np.ones(n))], axis=1)
+    of_rows, of_columns = absolute_sums(A)
+    size = np.stack([of_rows, layout.without_ghosts(of_columns)], axis=1)
     component = component[:n]
     vanishing = np.abs(A @ ones) <= tolerance * size[:, :1]
     vanishing &= np.abs(layout.without_ghosts(A.T @ ones[:n])) <= tolerance * size[:, 1:]

@@ -19,8 +19,10 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from thccs_fem.fem.levels import LevelMatrix, owners_of
+from thccs_fem.fem.petsc.matrices import sharing
 from thccs_fem.parallel import gathered, rank_of
-from thccs_fem.subdivision import Ints
+from thccs_fem.sparse import restricted, rows_of, stacked
+from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["GaussSeidel"]
 
@@ -46,19 +48,18 @@ class GaussSeidel:
         smoothed = np.zeros(A.shape[1], dtype=bool)
         smoothed[functions] = True
         before = smoothed & (owners_of(matrix.dofs) < rank_of(self._comm))
-        meets = np.bincount(matrix.rows, before[A.indices], minlength=owned.size) > 0
+        meets = _has_entries(restricted(A, np.arange(owned.size), np.flatnonzero(before)))
         self._inner = np.flatnonzero(smoothed[owned] & ~meets)
         self._last = np.flatnonzero(smoothed[owned] & meets)
         of_all = gathered(self._comm, owned[self._last])
         counts = self._comm.allgather(self._last.size)
         first = sum(counts[: rank_of(self._comm)])
         self._place = slice(first, first + self._last.size)
-        inner = A[self._inner]
-        between = inner[:, of_all]
-        self._beside = np.flatnonzero(np.diff(between.indptr))
-        self._between = between[self._beside]
-        self._sweep = _Sweep(inner[:, owned[self._inner]])
-        self._sweep_last = _Sweep(sp.vstack(self._comm.allgather(A[self._last][:, of_all]), format="csr"))
+        between = restricted(A, self._inner, of_all)
+        self._beside = np.flatnonzero(_has_entries(between))
+        self._between = rows_of(between, self._beside)
+        self._sweep = _Sweep(restricted(A, self._inner, owned[self._inner]))
+        self._sweep_last = _Sweep(stacked(self._comm.allgather(restricted(A, self._last, of_all))))
 
     def apply(self, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec) -> None:
         """Set x to M^-1 b, which is zero for functions that are not smoothed."""
@@ -89,11 +90,9 @@ class _Sweep:
     """
 
     def __init__(self, A: sp.csr_array):
-        A = sp.csr_array(A)
         A.sort_indices()
         self.size = A.shape[0]
-        csr: Any = A.indptr.astype(PETSc.IntType, copy=False), A.indices.astype(PETSc.IntType, copy=False), A.data
-        self._mat = PETSc.Mat().createAIJ(A.shape, csr=csr, comm=PETSc.COMM_SELF)
+        self._mat = sharing(A, PETSc.COMM_SELF)
         self._diagonal = None if _has_rows_alike(A) else A.diagonal()
         inodes: Any = PETSc.Mat.Option.USE_INODES
         self._mat.setOption(inodes, self._diagonal is None)
@@ -122,7 +121,13 @@ class _Sweep:
 
 
 def _has_rows_alike(A: sp.csr_array) -> bool:
-    """Return whether many rows have entries in the columns of the row before."""
-    sums = np.concatenate([[0], np.cumsum(A.indices, dtype=np.int64)])[A.indptr]
-    alike = (np.diff(A.indptr, 2) == 0) & (np.diff(sums, 2) == 0)
+    """Return whether many rows have entries in the columns of the row before, by three of their columns."""
+    first, last = A.indptr[:-1], A.indptr[1:] - 1
+    seen = A.indices[np.stack([first, (first + last) // 2, last])]  # no row is without its diagonal
+    alike = (np.diff(A.indptr, 2) == 0) & (np.diff(seen) == 0).all(axis=0)
     return bool(np.count_nonzero(alike) > ALIKE * A.shape[0])
+
+
+def _has_entries(A: sp.csr_array) -> Bools:
+    """Return for each row whether there is any."""
+    return np.diff(A.indptr) > 0

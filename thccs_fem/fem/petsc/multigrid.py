@@ -19,12 +19,14 @@ from petsc4py import PETSc
 import numpy as np
 import scipy.sparse as sp
 
+from thccs_fem.fem.entries import Numbering
 from thccs_fem.fem.levels import LevelMatrix, Levels, prolongations_below
 from thccs_fem.fem.petsc.gauss_seidel import GaussSeidel
-from thccs_fem.fem.petsc.matrices import sharing
+from thccs_fem.fem.petsc.matrices import sharing, values_of
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import total
+from thccs_fem.sparse import absolute_sums, csr
 from thccs_fem.subdivision import Bools, Ints
 
 __all__ = ["LARGEST_COARSE", "has_coarse_level", "multigrid"]
@@ -105,18 +107,24 @@ def _update(ksp: PETSc.KSP, b: PETSc.Vec, x: PETSc.Vec, levels: Levels, last: li
     matrices = levels.matrices(_rows(P, levels.dofs[-1]))
     if P.getNullSpace().handle:
         matrices[0] = matrices[0].with_diagonal(1.0 + KERNEL_SHIFT)
-    _make(ksp.getPC(), levels, matrices)
+    _make(ksp.getPC(), P, levels, matrices)
 
 
 def _rows(A: PETSc.Mat, dofs: IndexMap) -> sp.csr_array:
-    """Return the rows of a matrix that this rank owns."""
-    indptr, indices, data = A.getValuesCSR()
-    if dofs.global_numbers is not None:
-        indices = np.argsort(dofs.global_numbers).astype(np.int32)[indices]
-    return sp.csr_array((data, indices, indptr), shape=(dofs.size_local, dofs.size_global))
+    """Return the rows of a matrix that this rank owns; its values are not copied, where they are at hand."""
+    values, columns = values_of(A), A.getAttr("columns")
+    if values is None:
+        indptr, indices, data = A.getValuesCSR()
+        values, columns = sp.csr_array((data, indices, indptr), shape=(dofs.size_local, dofs.size_global)), None
+    if dofs.global_numbers is None:
+        return values
+    numbers = np.argsort(dofs.global_numbers).astype(np.int32)  # of PETSc's columns
+    if isinstance(columns, Numbering):
+        numbers = numbers[columns.numbers]
+    return csr(values.data, numbers[values.indices], values.indptr, (dofs.size_local, dofs.size_global))
 
 
-def _make(pc: PETSc.PC, levels: Levels, matrices: Sequence[LevelMatrix]) -> None:
+def _make(pc: PETSc.PC, finest: PETSc.Mat, levels: Levels, matrices: Sequence[LevelMatrix]) -> None:
     """Make a cycle of matrices, from scratch: PETSc would go on to compute residuals with those of last time."""
     pc.setType("none")
     pc.setType("mg")
@@ -129,7 +137,8 @@ def _make(pc: PETSc.PC, levels: Levels, matrices: Sequence[LevelMatrix]) -> None
     for l, (P, matrix) in enumerate(zip(levels.prolongations, matrices[1:], strict=True), 1):
         pc.setMGInterpolation(l, _mat(matrix.owned_rows(P), levels.dofs[l - 1], pc.comm))
         smoothers.append(pc.getMGSmoother(l))
-        smoothers[-1].setOperators(_mat(matrix.values, matrix.dofs, pc.comm))
+        is_finest = matrix is matrices[-1]  # PETSc has that already
+        smoothers[-1].setOperators(finest if is_finest else _mat(matrix.values, matrix.dofs, pc.comm))
         smoothers[-1].setTolerances(max_it=steps)
         _set_smoother(smoothers[-1].getPC(), matrix, levels.smoothed[l])
     # Matrices are there: none are asked of the DM of a SNES or TS.
@@ -160,15 +169,17 @@ def _growth(levels: Levels, matrices: Sequence[LevelMatrix]) -> float:
 def _typical_energy(A: LevelMatrix, functions: Bools) -> float:
     """Return the geometric mean of the diagonal entries of functions, those with a Dirichlet condition aside."""
     diagonal = A.diagonal
-    sizes = sp.csr_array((np.abs(A.values.data), A.values.indices, A.values.indptr), shape=A.values.shape)
-    free = functions[A.owned] & (sizes @ np.ones(sizes.shape[1]) > np.abs(diagonal))
+    free = functions[A.owned] & (absolute_sums(A.values)[0] > np.abs(diagonal))
     logarithms, count = total(A.dofs.comm, np.array([np.log(diagonal[free]).sum(), np.count_nonzero(free)]))
     return float(np.exp(logarithms / count)) if count else 1.0
 
 
 def _set_smoother(pc: PETSc.PC, matrix: LevelMatrix, functions: Ints) -> None:
     """Smooth the given functions alone."""
-    if matrix.dofs.is_whole or PETSc.Options(pc.getOptionsPrefix()).hasName("sub_pc_type"):
+    has_method = PETSc.Options(pc.getOptionsPrefix()).hasName("sub_pc_type")
+    if matrix.dofs.is_whole and functions.size == matrix.owned.size and not has_method:
+        pc.setType("sor")  # a subdomain of all would be a copy of the matrix
+    elif matrix.dofs.is_whole or has_method:
         pc.setType("asm")
         pc.setASMOverlap(0)
         subdomain = PETSc.IS().createGeneral(_owned_of(functions, matrix.dofs), comm=PETSc.COMM_SELF)
@@ -218,8 +229,14 @@ def _mat(A: sp.csr_array, columns: IndexMap, comm: Any) -> PETSc.Mat:
     if columns.global_numbers is None:
         A.sort_indices()  # which PETSc takes for granted
         return sharing(A, comm)
-    A = sp.csr_array((A.data.copy(), columns.global_numbers[A.indices], A.indptr), shape=A.shape)
+    begin, end = columns.local_range
+    held = np.zeros(columns.size_global, dtype=bool)  # by PETSc's numbers
+    held[columns.global_numbers[A.indices]] = True
+    held[begin:end] = False
+    numbers = np.concatenate([np.arange(begin, end), np.flatnonzero(held)]).astype(np.int32)
+    local = np.zeros(columns.size_global, dtype=np.int32)
+    local[numbers] = np.arange(numbers.size)
+    indices = local[columns.global_numbers][A.indices]
+    A = csr(A.data.copy(), indices, A.indptr, (A.shape[0], numbers.size))
     A.sort_indices()
-    csr: Any = tuple(array.astype(PETSc.IntType, copy=False) for array in (A.indptr, A.indices))
-    size: Any = (A.shape[0], None), (columns.size_local, columns.size_global)  # None: whatever it is
-    return PETSc.Mat().createAIJ(size, csr=(*csr, A.data), comm=comm)
+    return sharing(A, comm, Numbering(columns.comm, columns.starts, numbers))
