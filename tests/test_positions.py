@@ -53,6 +53,13 @@ def test_wrong_positions_are_refused(function: Callable[..., object]) -> None:
         function(mesh, [1.5], [(0.0, 0.0)])
 
 
+@pytest.mark.parametrize("function", [in_quads, in_sub_quads])
+def test_there_may_be_no_positions(function: Callable[..., tuple[np.ndarray, np.ndarray]]) -> None:
+    for corner in (None, []):
+        faces, uv = function(polygons(), [], [], corner)
+        assert (faces.shape, faces.dtype, uv.shape) == ((0,), np.int32, (0, 2))
+
+
 def test_points_on_sides_run_from_corner_to_corner() -> None:
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     points = side_points([0.0, 0.25, 1.0])

@@ -8,7 +8,20 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from thccs_fem.sparse import COMPUTED, EMPTY, Triplets, csr, entries, first_rows, product, rows_of, stacked, summed
+from thccs_fem.sparse import (
+    COMPUTED,
+    EMPTY,
+    Triplets,
+    absolute_sums,
+    csr,
+    entries,
+    first_rows,
+    product,
+    restricted,
+    rows_of,
+    stacked,
+    summed,
+)
 
 SEEDS = st.integers(0, 2**32 - 1)
 ROUNDING = 1e-14  # sums of some dozen products of numbers up to 1
@@ -75,6 +88,24 @@ def test_products_with_rows_given(seed, sizes):
 def test_products_have_no_zeros():
     a, b = sp.csr_array([[1.0, -1.0], [1.0, 1.0]]), sp.csr_array([[0.5, 1.0], [0.5, 2.0]])
     assert product(a, b).nnz == 3
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, shape=st.tuples(st.integers(1, 9), st.integers(1, 9)))
+def test_parts_in_rows_and_columns(seed, shape):
+    _, a = random(seed, shape, 40)
+    rng = np.random.default_rng(seed)
+    rows = rng.integers(0, shape[0], rng.integers(0, 7))
+    columns = np.sort(rng.permutation(shape[1])[: rng.integers(0, shape[1] + 1)])
+    check(restricted(a, rows, columns), a[rows][:, columns])
+
+
+@settings(max_examples=30)
+@given(seed=SEEDS, shape=st.tuples(st.integers(0, 9), st.integers(1, 9)))
+def test_absolute_sums(seed, shape):
+    _, a = random(seed, shape, 40)
+    for found, axis in zip(absolute_sums(a), (1, 0), strict=True):
+        np.testing.assert_allclose(found, np.abs(a.toarray()).sum(axis=axis), rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("columns", [1, 40, 4000])

@@ -26,6 +26,7 @@ from scipy.spatial import KDTree
 from thccs_fem.bezier import VERTEX_PLACE, bezier_masks
 from thccs_fem.boundary import Boundary
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.parallel import end_together, together
 from thccs_fem.subdivision import control_level, subdivided
 
 __all__ = [
@@ -237,12 +238,19 @@ def implicit_surface(
     _check_count("smoothing", smoothing, minimum=0)
     axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"))
+    end_together(comm)
+    values = together(comm, lambda: _lattice_values(f, points))
+    vertices, quads = _surface_net(_filled(values))
+    scaled = low + vertices * (high - low) / (np.array(counts) - 1)
+    return ControlMesh(_smoothed(scaled, quads, smoothing), quads, comm=comm)
+
+
+def _lattice_values(f: Callable[[Floats], npt.ArrayLike], points: Floats) -> Floats:
+    """Return the values at the points of a lattice, shape (n, m, k), of points of shape (3, n, m, k)."""
     values = np.asarray(f(points.reshape(3, -1)), dtype=np.float64)
     if values.size != points[0].size:
         raise ValueError(f"f returned {values.size} values for {points[0].size} points: expected one for each")
-    vertices, quads = _surface_net(_filled(values.reshape(counts)))
-    scaled = low + vertices * (high - low) / (np.array(counts) - 1)
-    return ControlMesh(_smoothed(scaled, quads, smoothing), quads, comm=comm)
+    return values.reshape(points.shape[1:])
 
 
 def _lattice_box(

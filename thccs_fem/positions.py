@@ -82,6 +82,8 @@ def _checked_positions(
     faces = np.atleast_1d(np.asarray(faces))
     uv = np.asarray(uv, dtype=np.float64)
     corner = np.full(faces.shape, -1) if corner is None else np.asarray(corner)
+    if not (faces.size or uv.size or corner.size):  # no points: lists without any are of no shape and no type
+        faces, uv, corner = np.zeros(0, dtype=np.int32), np.zeros((0, 2)), np.zeros(0, dtype=np.int32)
     if not np.issubdtype(faces.dtype, np.integer) or not np.issubdtype(corner.dtype, np.integer):
         raise TypeError(f"faces and corner must be integers, got {faces.dtype} and {corner.dtype}")
     if corner.shape != faces.shape:

@@ -1,5 +1,6 @@
 """Multigrid on several ranks: its levels, its smoother and its iterations are those of one rank."""
 
+import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -19,6 +20,7 @@ from thccs_fem.fem import petsc
 from thccs_fem.fem.levels import LevelMatrix, Levels, owners_of
 from thccs_fem.fem.petsc import gauss_seidel
 from thccs_fem.fem.petsc.gauss_seidel import GaussSeidel
+from thccs_fem.fem.petsc.matrices import values_of
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.forms import biharmonic, laplace_beltrami, linear_elasticity, plate
 from thccs_fem.hierarchy import Hierarchy
@@ -106,6 +108,23 @@ def test_work_is_spread(comm: MPI.Comm) -> None:
     levels = Levels.of(space("sphere", comm))
     for dofs in levels.dofs:
         assert dofs.size_local < 1.5 * dofs.size_global / comm.size
+
+
+def test_rows_of_a_matrix_are_those_that_petsc_has(comm: MPI.Comm) -> None:
+    V = space("L-domain", comm, (2,))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    form = fem.form(linear_elasticity.a(u, v))
+    A, dofs = petsc.assemble_matrix(form), Levels.of(V).dofs[-1]
+    rows_of = sys.modules["thccs_fem.fem.petsc.multigrid"]._rows
+    expected = rows(V, linear_elasticity.a).toarray()
+    for factor in (1.0, 3.0):  # the second one is unknown to us
+        if factor != 1.0:
+            A.scale(factor)
+        assert (values_of(A) is None) == (factor != 1.0)
+        np.testing.assert_allclose(rows_of(A, dofs).toarray(), factor * expected, rtol=1e-14)
+    petsc.assemble_matrix(A, form)
+    assert values_of(A) is not None
+    np.testing.assert_allclose(rows_of(A, dofs).toarray(), expected, rtol=1e-14)
 
 
 # ---- The smoother ----------------------------------------------------------------------------------------------------
@@ -222,7 +241,7 @@ def test_options_of_the_levels(comm: MPI.Comm, option: str, kind: str) -> None:
     found = [each.solve().x.array.copy() for each in (usual, other)]
     np.testing.assert_allclose(*found, rtol=0, atol=1e-10)
     kinds = [each.solver.getPC().getMGSmoother(1).getPC().getType() for each in (usual, other)]
-    assert kinds == ["python" if comm.size > 1 else "asm", kind]
+    assert kinds == ["python" if comm.size > 1 else "sor", kind]
 
 
 def test_large_problems_are_iterated(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh, Domain
+from thccs_fem.parallel import rank_of
 from ufl.algorithms import apply_algebra_lowering, apply_derivatives
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.domain import extract_domains
@@ -105,12 +106,13 @@ def check_caps(ufl_form: ufl.Form, hierarchy: Hierarchy) -> None:
     """Warn of shallow caps where second derivatives of arguments see their kinks.
 
     Warns:
-        UserWarning: There are some.
+        UserWarning: There are some. On rank 0 alone.
     """
     root = hierarchy.root
     valences = root.vertex_num_faces[~root.regular & ~root.boundary]
     needed = 0 if not valences.size else DEEP_AT_VALENCE_3 if (valences == 3).all() else DEEP
-    if hierarchy.cap_level < needed and max(argument_orders(ufl_form), default=0) > 1:
+    is_first = rank_of(hierarchy.mesh.comm) == 0
+    if is_first and hierarchy.cap_level < needed and max(argument_orders(ufl_form), default=0) > 1:
         warnings.warn(
             f"the form has second derivatives of its test or trial function, and the mesh extraordinary vertices (of "
             f"valence {', '.join(map(str, np.unique(valences)))}), near which functions are C1 up to kinks in bicubic "

@@ -259,16 +259,21 @@ def prolongations_below(hierarchy: Hierarchy) -> list[sp.csr_array]:
     """Return the prolongations from coarser meshes up to level 0, until one has few functions; once for a mesh."""
     known = _below.setdefault(hierarchy.root, {})
     if hierarchy.rule not in known:
-        known[hierarchy.rule] = []
-        level, size = hierarchy.root, hierarchy.stages[0].boundary.num_functions
-        while size > SMALL and (found := coarsened(level, hierarchy.rule)) is not None:
-            level, matrix = found
-            known[hierarchy.rule].insert(0, _without_rounding(matrix))
-            size = matrix.shape[1]
+        known[hierarchy.rule] = _made_below(hierarchy)
     return list(known[hierarchy.rule])
 
 
 _below: WeakKeyDictionary[Level, dict[BoundaryRule, list[sp.csr_array]]] = WeakKeyDictionary()  # by level 0
+
+
+def _made_below(hierarchy: Hierarchy) -> list[sp.csr_array]:
+    prolongations: list[sp.csr_array] = []
+    level, size = hierarchy.root, hierarchy.stages[0].boundary.num_functions
+    while size > SMALL and (found := coarsened(level, hierarchy.rule)) is not None:
+        level, matrix = found
+        prolongations.insert(0, _without_rounding(matrix))
+        size = matrix.shape[1]
+    return prolongations
 
 
 def _coefficients(V: FunctionSpace) -> Sequence[sp.csr_array]:

@@ -126,7 +126,7 @@ class EigenProblem:
             values, vectors = system.complete(self._search, count, accuracy=solver.getTolerances()[0])
         finally:
             solver.setDimensions(system.num_eigenvalues)
-        self._options.warn_unused()
+        self._options.warn_unused(self._comm)
         return system.accept(
             values, vectors, f"SLEPc's {solver.getType()}, after {solver.getIterationNumber()} iterations,"
         )

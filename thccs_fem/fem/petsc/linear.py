@@ -166,7 +166,7 @@ class LinearProblem:
             self._solver.solve(self.b, new_vec(x, self._comm))
         system.layout.spread(x, system.unknowns)
         self._check(x)
-        self._options.warn_unused()
+        self._options.warn_unused(self._comm)
         return system.accept(x)
 
     def _make_ready(self) -> None:

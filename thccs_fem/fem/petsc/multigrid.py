@@ -1,9 +1,9 @@
 """Multigrid from subdivision: the levels of a hierarchy as the levels of PETSc's PCMG.
 
 The levels, and their matrices, are those of `fem.levels`. Each smooths a part of its functions, by Chebyshev's method
-with symmetric Gauss-Seidel. In serial this is PETSc's, in the one subdomain of an additive Schwarz method. On several
-ranks it is that of `gauss_seidel`, which is as good, for any number of ranks; PETSc's would know nothing of what other
-ranks do meanwhile, and takes up to twice as many iterations.
+with symmetric Gauss-Seidel. In serial this is PETSc's; where not all functions are smoothed, in the one subdomain of an
+additive Schwarz method. On several ranks it is that of `gauss_seidel`, which is as good, for any number of ranks;
+PETSc's would know nothing of what other ranks do meanwhile, and takes up to twice as many iterations.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def _mat(A: sp.csr_array, columns: IndexMap, comm: Any) -> PETSc.Mat:
     numbers = np.concatenate([np.arange(begin, end), np.flatnonzero(held)]).astype(np.int32)
     local = np.zeros(columns.size_global, dtype=np.int32)
     local[numbers] = np.arange(numbers.size)
-    indices = local[columns.global_numbers][A.indices]
-    A = csr(A.data.copy(), indices, A.indptr, (A.shape[0], numbers.size))
+    indices, indptr = local[columns.global_numbers][A.indices], A.indptr.astype(np.int32, copy=False)
+    A = csr(A.data.copy(), indices, indptr, (A.shape[0], numbers.size))
     A.sort_indices()
     return sharing(A, comm, Numbering(columns.comm, columns.starts, numbers))

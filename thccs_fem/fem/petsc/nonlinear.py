@@ -152,7 +152,7 @@ class NonlinearProblem:
         self.norms = self._solver.getConvergenceHistory()[0].tolist()
         system.layout.spread(x, system.unknowns)
         self._check(x)
-        self._options.warn_unused()
+        self._options.warn_unused(self._comm)
         return system.accept(x)
 
     def _set_up(self) -> None:

@@ -9,6 +9,8 @@ from typing import Any
 
 from petsc4py import PETSc
 
+from thccs_fem.parallel import rank_of
+
 __all__ = ["Options"]
 
 
@@ -55,8 +57,8 @@ class Options:
             for name, text in before.items():
                 options.setValue(name, text)
 
-    def warn_unused(self) -> None:
-        """Warn, once, of options that nothing has read; to be called by what the user calls."""
-        if self._unused:
+    def warn_unused(self, comm: Any) -> None:
+        """Warn, once and on rank 0, of options that nothing has read; to be called by what the user calls."""
+        if self._unused and rank_of(comm) == 0:
             warnings.warn(f"PETSc made no use of the options {sorted(self._unused)}: are they misspelt?", stacklevel=3)
-            self._unused.clear()
+        self._unused.clear()

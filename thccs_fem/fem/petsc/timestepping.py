@@ -189,7 +189,7 @@ class TimeProblem:
         self._before = before
         self._equations.accept(self.time, values_of(x))
         ts.monitor(self.step_number, self.time, x)
-        self._options.warn_unused()
+        self._options.warn_unused(self._comm)
         return self.u
 
     def steps(self, until: float) -> Iterator[Function]:
