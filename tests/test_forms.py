@@ -182,7 +182,7 @@ def test_cells_are_those_of_the_finest_space(order: int) -> None:
     form = fem.form(ufl.TestFunction(spaces[0]) * fem.Function(spaces[1]) * dx)
     assert form.cells is fine.cells
     assert set(form.transfers) == {V.hierarchy}
-    assert form.transfers[V.hierarchy].shape == (fine.num_dofs, V.num_dofs)
+    assert form.transfers[V.hierarchy].matrix.shape == (fine.num_dofs, V.num_dofs)
 
 
 def test_equal_hierarchies_need_no_transfer() -> None:

@@ -17,6 +17,7 @@ import thccs_fem
 # defaults.
 ANY = inspect.Parameter.empty
 SIGNATURES = {
+    "parallel.all_arrive": "comm",
     "parallel.size_of": "comm",
     "parallel.rank_of": "comm",
     "parallel.total": "comm, value",

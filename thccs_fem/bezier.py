@@ -45,7 +45,7 @@ def bezier_masks(boundary: Boundary, faces: Ints) -> sp.csr_array:
         return sp.csr_array(shape)
     used, averages = _averages(level, half_edges)
     rows = product(averages, _face_corner_points(level, used, boundary.num_functions))
-    if level.rim[half_edges].any():
+    if level.boundary[level.vertices[half_edges]].any():
         rows = summed([entries(rows), *_rim_rows(boundary, half_edges)], shape)
     # Row 4 * half-edges + (vertex, next, previous, face corner) as built, row 16 * face + place as wanted.
     order = np.zeros((faces.size, 16), dtype=np.int32)

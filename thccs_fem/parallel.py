@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 __all__ = [
+    "all_arrive",
     "by_first_rank",
     "end_together",
     "gathered",
@@ -140,6 +141,24 @@ def by_first_rank[T](comm: Any, work: Callable[[], T]) -> T:
     return result
 
 
+def all_arrive(comm: Any) -> bool:
+    """Return whether all ranks call this at about the same time: did what failed here fail everywhere?
+
+    To be asked before what failed is undone together, where it may have failed on one rank alone. Of all functions here
+    this is the only one that does not wait for ever.
+
+    Args:
+        comm: Communicator, or None.
+    """
+    if size_of(comm) == 1:
+        return True
+    request = comm.Ibarrier()
+    end = time.monotonic() + PATIENCE
+    while not (arrived := bool(request.Test())) and time.monotonic() < end:
+        time.sleep(0.01)
+    return arrived
+
+
 def _report(error: BaseException) -> Report:
     """Return what other ranks need to raise an exception like this one."""
     message = str(error)
@@ -207,12 +226,15 @@ class _EndTogether:
             sys.stderr.flush()
             os._exit(1)
         first = getattr(error, FIRST, -1)  # which has the traceback that leads to where it happened
+        # All of MPI's ranks wait for each other at the end, so that those outside of the communicator count.
+        world = getattr(sys.modules.get(type(self.comm).__module__), "COMM_WORLD", self.comm)
+        some_go_on = len(failed) < world.size
         if self.comm.rank == (first if first in failed else min(failed)):
             self._show(failed, kind, error, trace)
-        elif len(failed) < self.comm.size:
+        elif some_go_on:
             time.sleep(5 * PATIENCE)  # the first ends us meanwhile
-        if len(failed) < self.comm.size:
-            self.comm.Abort(1)
+        if some_go_on:
+            world.Abort(1)
 
     def _failed(self, line: str) -> dict[int, str]:
         """Return the ranks that fail at about this time, and how each."""

@@ -81,6 +81,44 @@ def test_different_errors_of_all_ranks(tmp_path: Path) -> None:
     assert output.endswith(f"\n{first}rank 1 of 2 failed, too: {second}")
 
 
+@pytest.mark.parametrize("lines", ["", "comm.barrier()"], ids=["others end", "others wait"])
+def test_error_of_a_part_of_the_ranks_ends_all(tmp_path: Path, lines: str) -> None:
+    script = f"""
+sys.excepthook = sys.__excepthook__
+part = comm.Split(comm.rank > 0)
+generators.rectangle((1, 1), comm=part)
+if comm.rank > 0:
+    raise ArithmeticError("in one part")
+{lines}
+"""
+    output = ending(tmp_path, 3, script)
+    assert output.startswith("Traceback")
+    assert "\nArithmeticError: in one part\n" in output
+
+
+def test_conditions_that_fail_on_one_rank_in_a_step(tmp_path: Path) -> None:
+    script = """
+import ufl
+from thccs_fem import fem
+from thccs_fem.fem.petsc import TimeProblem
+
+V = fem.functionspace(generators.rectangle((4, 2), comm=comm), ("THCCS", 3))
+u, udot, v = fem.Function(V), fem.Function(V), ufl.TestFunction(V)
+
+def bcs(V, time):
+    if time > 0.05 and comm.rank == 1:
+        raise ArithmeticError("no value")
+    return [fem.dirichletbc(time, fem.boundary_dofs(V), V)]
+
+TimeProblem(udot * v * ufl.dx, u, udot, dt=0.1, bcs=bcs, petsc_options_prefix="t_").solve(0.2)
+"""
+    file = tmp_path / "script.py"
+    file.write_text(START + script)
+    code, output = run_on_ranks(2, str(file), time_limit=SECONDS, cwd=tmp_path)
+    assert code == 1
+    assert "\nArithmeticError: no value\n" in output
+
+
 def test_communicator_that_is_gone(tmp_path: Path) -> None:
     script = """
 part = comm.Dup()

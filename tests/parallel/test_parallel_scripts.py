@@ -12,7 +12,7 @@ from compared import same_as_in_serial
 from spread import by_number, refined, whole
 
 import ufl
-from thccs_fem import fem, generators, quadrature
+from thccs_fem import fem, generators, parallel, quadrature
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.petsc import LinearProblem
 from thccs_fem.hierarchy import Hierarchy
@@ -38,6 +38,18 @@ def test_region_that_fails_on_one_rank_fails_on_all(comm: MPI.Comm) -> None:
 
     with pytest.raises(ArithmeticError, match=rf"^rank 1 of {comm.size}: no value$"):
         generators.implicit_surface(ball, (6, 6, 6), comm=comm)
+
+
+def test_ranks_know_whether_all_arrive(comm: MPI.Comm, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = comm.Dup()  # on which one message is on its way until the last rank comes
+    assert parallel.all_arrive(own)
+    monkeypatch.setattr(parallel, "PATIENCE", 0.1)
+    if comm.rank == 1:
+        comm.barrier()
+        assert parallel.all_arrive(own)
+    else:
+        assert not parallel.all_arrive(own)
+        comm.barrier()
 
 
 def warnings_of(work: Callable[[], object]) -> list[str]:

@@ -55,7 +55,7 @@ VANISHING = 1e-13  # sum of a row, relative to that of absolute values; second-o
 PRESCRIBED = 1e-6  # the same, where but for prescribed values it is zero by the form; fourth-order ones come to 1e-10
 INCOMPATIBLE = 1e-6  # mean of a load, relative to that of its absolute value; less is left by quadrature
 ROUNDING = 1e-12  # the same, relative to all components: one may be but rounding of the others
-LARGEST_CONDITION = 1e12  # of a scaled matrix; singular ones come to 1e13 and more, fine fourth-order ones to 1e8
+LARGEST_CONDITION = 1e11  # of a scaled matrix; singular ones come to 5e11 and more, fine fourth-order ones to 1e8
 
 
 class LinearSystem:

@@ -25,7 +25,7 @@ from thccs_fem.fem.petsc.gauss_seidel import GaussSeidel
 from thccs_fem.fem.petsc.matrices import sharing, values_of
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.index_map import IndexMap
-from thccs_fem.parallel import total
+from thccs_fem.parallel import rank_of, total
 from thccs_fem.sparse import absolute_sums, csr
 from thccs_fem.subdivision import Bools, Ints
 
@@ -74,7 +74,7 @@ def multigrid(ksp: PETSc.KSP, V: FunctionSpace) -> None:
     if not isinstance(ksp, PETSc.KSP):
         raise TypeError(f"multigrid needs the KSP of a problem, multigrid(problem.solver, V), got {type(ksp).__name__}")
     levels = Levels.of(V)
-    if levels.sizes[0] > LARGEST_COARSE:
+    if levels.sizes[0] > LARGEST_COARSE and rank_of(V.mesh.comm) == 0:
         warnings.warn(
             f"the coarsest level has {levels.sizes[0]} dofs, all of which are in the matrix to be factorised: the "
             f"control mesh of {V.mesh.num_faces} faces is not the subdivision of a coarser one. Begin with a coarser "

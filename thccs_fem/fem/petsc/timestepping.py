@@ -27,7 +27,7 @@ from thccs_fem.fem.petsc.evolution import Conditions, EvolutionEquations, values
 from thccs_fem.fem.petsc.matrices import new_vec, solver_comm
 from thccs_fem.fem.petsc.options import Options
 from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.parallel import total
+from thccs_fem.parallel import all_arrive, total
 
 __all__ = ["TimeProblem"]
 
@@ -180,9 +180,10 @@ class TimeProblem:
                 where = f"in the step from t = {before[0]:g} with dt = {dt:g}"
                 raise RuntimeError(f"PETSc's {ts.getType()} failed {where}: {_why(ts)}")
         except Exception as error:
-            self._equations.accept(*before)
-            self._equations.forget()
-            self._ts = self._stepper(before[0], number, dt)
+            if all_arrive(self._comm):  # else bcs failed on some ranks alone, which ends all
+                self._equations.accept(*before)
+                self._equations.forget()
+                self._ts = self._stepper(before[0], number, dt)
             if isinstance(error, PETSc.Error) and error.__cause__ is not None:  # what bcs raised
                 raise error.__cause__ from None
             raise
