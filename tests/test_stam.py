@@ -46,7 +46,7 @@ def turned(mesh: ControlMesh) -> ControlMesh:
 
 
 def rounding(valence: int) -> float:
-    """Return what rounding may leave in sums of as many terms as there are faces, half a unit in the last place each."""
+    """Return what rounding may leave in sums over the faces, half a unit in the last place for each."""
     return max(1e-15, valence * np.finfo(float).eps / 2.0)
 
 

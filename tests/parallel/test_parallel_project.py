@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from compared import same_as_in_serial, shared
+from spread import whole
 from zoo import ZOO
 
 import ufl
@@ -42,14 +43,6 @@ def some_function(V: FunctionSpace | CellwiseSpace) -> fem.Function:
     k = V.block_size
     u.x.array = np.sin(k * V.index_map.numbers[:, None] + np.arange(k)).ravel()
     return u
-
-
-def whole(u: fem.Function) -> Floats:
-    """Return the coefficients in the order of a serial run, once ghosts are seen to be those of their owners."""
-    before = u.x.array.copy()
-    u.x.scatter_forward()
-    np.testing.assert_array_equal(u.x.array, before)
-    return u.x.index_map.gather(u.x.array.reshape(-1, u.x.block_size))
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ A `CellwiseSpace` holds coefficients that are constant on each cell.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, Literal, overload
@@ -39,7 +40,33 @@ ConstantElement = (
 )
 
 
-class FunctionSpace(ufl.FunctionSpace):
+class _OnRanks(ABC):
+    """Numbers of degrees of freedom, `block_size` for each index of a map."""
+
+    block_size: int
+
+    @property
+    @abstractmethod
+    def index_map(self) -> IndexMap:
+        """What this rank owns, and of what it holds copies."""
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of degrees of freedom, global."""
+        return self.block_size * self.index_map.size_global
+
+    @property
+    def num_owned_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns."""
+        return self.block_size * self.index_map.size_local
+
+    @property
+    def num_local_dofs(self) -> int:
+        """Number of degrees of freedom that this rank owns or has as ghosts."""
+        return self.block_size * self.index_map.numbers.size
+
+
+class FunctionSpace(ufl.FunctionSpace, _OnRanks):
     """THCCS functions with values of a given shape; make one with `functionspace`, refine it with `adapt.refine`.
 
     Args:
@@ -85,21 +112,6 @@ class FunctionSpace(ufl.FunctionSpace):
     def num_functions(self) -> int:
         """Number of scalar functions, global."""
         return self.hierarchy.num_dofs
-
-    @property
-    def num_dofs(self) -> int:
-        """Number of degrees of freedom, block_size for each scalar function, global."""
-        return self.block_size * self.num_functions
-
-    @property
-    def num_owned_dofs(self) -> int:
-        """Number of degrees of freedom that this rank owns."""
-        return self.block_size * self.index_map.size_local
-
-    @property
-    def num_local_dofs(self) -> int:
-        """Number of degrees of freedom that this rank owns or has as ghosts."""
-        return self.block_size * self.index_map.numbers.size
 
     @property
     def num_cells(self) -> int:
@@ -209,7 +221,7 @@ class FunctionSpace(ufl.FunctionSpace):
         )
 
 
-class CellwiseSpace(ufl.FunctionSpace):
+class CellwiseSpace(ufl.FunctionSpace, _OnRanks):
     """Functions that are constant on each face of a control mesh, or each cell of a hierarchy; for coefficients.
 
     Make one with ``functionspace(msh, ("DG", 0))`` or with `cellwise`. Degree of freedom `block_size * i + c` is
@@ -240,21 +252,6 @@ class CellwiseSpace(ufl.FunctionSpace):
     def num_cells(self) -> int:
         """Number of faces or cells, global."""
         return self.index_map.size_global
-
-    @property
-    def num_dofs(self) -> int:
-        """Number of degrees of freedom, block_size for each face or cell, global."""
-        return self.block_size * self.num_cells
-
-    @property
-    def num_owned_dofs(self) -> int:
-        """Number of degrees of freedom that this rank owns."""
-        return self.block_size * self.index_map.size_local
-
-    @property
-    def num_local_dofs(self) -> int:
-        """Number of degrees of freedom that this rank owns or has as ghosts."""
-        return self.block_size * self.index_map.numbers.size
 
     @cached_property
     def cells(self) -> Cells:
