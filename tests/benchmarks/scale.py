@@ -46,8 +46,8 @@ Two ranks, 497666 dofs, wall time of one by that of two (100 % is half the time 
 | 44 % | 103 % | 80 % | 74 % | 78 % |
 
 Set-up is done alike on all ranks, and so are the levels of multigrid. MB of arrays on one rank, and on each of two:
-control mesh 50, 50; hierarchy 69, 61; partition 4, 7; cells 117, 60; matrix 293, 147. The peak stays at 1.3 GB, since on
-several ranks the values of the matrix are there twice, and Gauss-Seidel's rows as well.
+control mesh 50, 50; hierarchy 69, 61; partition 4, 7; cells 117, 60; matrix 293, 147. The peak stays at 1.3 GB, since
+on several ranks the values of the matrix are there twice, and Gauss-Seidel's rows as well.
 """
 
 import argparse
