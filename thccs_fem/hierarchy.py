@@ -453,7 +453,7 @@ def _stages(
         outlines.append(before if before is not None and outline.is_of(before) else outline)
         if outline.children is None:
             return _with_functions(outlines, rule)
-        inside, held = (_children(outline.children, faces) for faces in (refined, refined | cut))
+        inside, held = (outline.children.marks_of(faces) for faces in (refined, refined | cut))
         level = outline.children.fine
 
 
@@ -542,13 +542,6 @@ def _needs_cut(level: Level, caps: Ints) -> Bools:
     ends_later = ~level.regular
     ends_later &= np.where(level.control_vertex >= 0, caps[level.control_vertex], 0) > level.number
     return level.touching(ends_later)
-
-
-def _children(step: Children, faces: Bools) -> Bools:
-    """Return the children of the marked quads, as marks on the fine level."""
-    marks = np.zeros(step.fine.num_faces, dtype=bool)
-    marks[(step.first_child[faces][:, None] + np.arange(4)).ravel()] = True
-    return marks
 
 
 def functions_meeting(boundary: Boundary, faces: Bools) -> Bools:

@@ -184,7 +184,8 @@ def _with_neighbours(stages: Sequence[Stage], cells: Sequence[Bools]) -> list[Bo
         found |= neighbourhood(stage.level, up)
     down = cells[0]
     for before, stage, marks, found in zip(stages, stages[1:], cells[1:], result[1:], strict=False):
-        down = marks | _children(before, stage, down)
+        assert before.step is not None  # there is a next level
+        down = marks | before.step.marks_of(down)
         found |= neighbourhood(stage.level, down)
     return [found & stage.inside & ~stage.refined for stage, found in zip(stages, result, strict=True)]
 
@@ -195,15 +196,6 @@ def _parents(stage: Stage, children: Bools) -> Bools:
     assert stage.step is not None  # there is a next level
     parents = np.flatnonzero(stage.step.first_child >= 0)
     marks[parents] = children[stage.step.first_child[parents][:, None] + np.arange(4)].any(axis=1)
-    return marks
-
-
-def _children(stage: Stage, fine: Stage, faces: Bools) -> Bools:
-    """Return marks of the children of marked faces, where there are any."""
-    marks = np.zeros(fine.level.num_faces, dtype=bool)
-    assert stage.step is not None  # there is a next level
-    first = stage.step.first_child[faces]
-    marks[first[first >= 0][:, None] + np.arange(4)] = True
     return marks
 
 
@@ -264,16 +256,14 @@ def needed_functions(hierarchy: Hierarchy, cells: Bools) -> list[Bools]:
 def _piece_faces(hierarchy: Hierarchy, cells: Bools) -> list[Bools]:
     """Return for each stage marks of the faces that are pieces of the given cells."""
     result, first = [], 0
-    cut: Bools = np.zeros(0, dtype=bool)
-    before: Stage | None = None
+    marks = np.zeros(hierarchy.root.num_faces, dtype=bool)
     for stage in hierarchy.stages:
         active = stage.active_faces
-        marks = np.zeros(stage.level.num_faces, dtype=bool) if before is None else _children(before, stage, cut)
         marks[active] = cells[first : first + active.size]
         first += active.size
-        cut = marks & stage.cut
         result.append(marks & ~stage.cut)
-        before = stage
+        if stage.step is not None:
+            marks = stage.step.marks_of(marks & stage.cut)
     return result
 
 

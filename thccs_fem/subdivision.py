@@ -301,6 +301,13 @@ class Children:
     old: Ints
     edges: Ints
 
+    def marks_of(self, faces: Bools) -> Bools:
+        """Return the children of marked quads, those that have any, as marks on the fine level."""
+        marks = np.zeros(self.fine.num_faces, dtype=bool)
+        first = self.first_child[faces]
+        marks[first[first >= 0][:, None] + np.arange(4)] = True
+        return marks
+
 
 @dataclass(frozen=True, eq=False)
 class Step(Children):
