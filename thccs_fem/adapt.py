@@ -293,8 +293,8 @@ def transfer(
     else:
         carried = projector(W.hierarchy, V, projection)(values)
     if conserve:
-        area = _integral(V, np.ones((len(carried), 1)))
-        carried += (_integral(W, values) - _integral(V, carried)) / area
+        found = _integral(V, np.column_stack([carried, np.ones(len(carried))]))
+        carried += (_integral(W, values) - found[:-1]) / found[-1]
     result = Function(V, u.name)
     result.x.array = carried.ravel()
     return result
