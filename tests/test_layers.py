@@ -25,7 +25,10 @@ LAYERS = """
     thccs_fem.fem.petsc.options
     thccs_fem.fem.petsc.linear thccs_fem.fem.petsc.nonlinear thccs_fem.fem.petsc.eigen
     thccs_fem.fem.petsc.evolution thccs_fem.fem.petsc.timestepping thccs_fem.fem.petsc
-    thccs_fem.estimate thccs_fem.checkpoint thccs_fem.adapt thccs_fem.vtk thccs_fem.io thccs_fem.plot
+    thccs_fem.estimate.indicators thccs_fem.estimate.error thccs_fem.estimate.residual thccs_fem.estimate.bubble
+    thccs_fem.estimate thccs_fem.checkpoint
+    thccs_fem.adapt.marking thccs_fem.adapt.remeshing thccs_fem.adapt.transfer thccs_fem.adapt.loop thccs_fem.adapt
+    thccs_fem.vtk thccs_fem.io thccs_fem.plot
     thccs_fem.dolfinx
 """.split()
 PATHS = {

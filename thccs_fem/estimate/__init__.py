@@ -1,0 +1,12 @@
+"""Error indicators, one a cell: the exact error, the residual of the strong form, and local problems on bubbles.
+
+Indicators are not squared; `norm` sums them up. On several ranks each has those of the cells that it owns; all
+functions are collective.
+"""
+
+from thccs_fem.estimate.bubble import bubble
+from thccs_fem.estimate.error import error
+from thccs_fem.estimate.indicators import norm
+from thccs_fem.estimate.residual import residual
+
+__all__ = ["bubble", "error", "norm", "residual"]
