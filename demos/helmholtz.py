@@ -92,22 +92,21 @@ msh = generators.l_domain(int(0.8 * k_room))
 x = ufl.SpatialCoordinate(msh)
 place, width = (0.6, -0.7), 0.05
 f = 1e3 * ufl.exp(-((x[0] - place[0]) ** 2 + (x[1] - place[1]) ** 2) / width**2)
-solutions: list[fem.Function] = []
 
 
-def solve(V: fem.FunctionSpace) -> fem.Function:
+def room(V: fem.FunctionSpace) -> LinearProblem:
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    problem = LinearProblem(helmholtz.a(u, v, k_room), helmholtz.L(f, v), petsc_options_prefix="room_")
-    solutions.append(problem.solve())
-    solutions[-1].name = "pressure"
-    return solutions[-1]
+    a, L = helmholtz.a(u, v, k_room), helmholtz.L(f, v)
+    return LinearProblem(a, L, u=fem.Function(V, "pressure"), petsc_options_prefix="room_")
 
 
+solutions: list[fem.Function] = []
 history = adapt.solve(
     fem.functionspace(msh, ("THCCS", 3)),
-    solve,
+    room,
     lambda uh: estimate.residual(uh, helmholtz.strong_residual(uh, f, k_room)),
-    steps=steps + 3,
+    stop=adapt.Stop(steps=steps + 3),
+    callback=lambda step, uh: solutions.append(uh),
 )
 print(history)
 before, uh = solutions[-2:]

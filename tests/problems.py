@@ -1,6 +1,7 @@
 """Model problems, and ways to refine, for the tests of rates, errors and marking."""
 
 from collections.abc import Sequence
+from math import cos, log2, pi, sqrt
 
 import numpy as np
 
@@ -13,11 +14,14 @@ from ufl import dx, grad, inner
 __all__ = [
     "errors",
     "graded_l_domain",
+    "halvings",
+    "laplacian",
     "lifted",
     "moved_inside",
     "poisson",
     "projected_in_h1",
     "randomly_refined",
+    "rates_at_extraordinary",
     "refined_anywhere",
     "refined_towards",
     "singular",
@@ -96,6 +100,20 @@ def graded_l_domain(num_levels: int, theta: float = 0.5) -> fem.FunctionSpace:
     return V
 
 
+# ---- Extraordinary vertices
+
+
+def halvings(valence: int) -> float:
+    """Return log2(1 / lambda), lambda the eigenvalue of Catmull and Clark's masks by which rings of faces shrink."""
+    c = cos(2 * pi / valence)
+    return -log2((5 + c + cos(pi / valence) * sqrt(18 + 2 * c)) / 16)
+
+
+def rates_at_extraordinary(valence: int) -> tuple[float, float]:
+    """Return the rates in L2 and H1, under uniform refinement, of a space without quadratic functions at a vertex."""
+    return min(4.0, 3 * halvings(valence)), min(3.0, 2 * halvings(valence))
+
+
 # ---- Exact solutions
 
 
@@ -115,6 +133,21 @@ def singular(x: Expr) -> Expr:
     c, s = np.cos(turned), np.sin(turned)
     theta = turned + ufl.atan2(c * x[1] - s * x[0], c * x[0] + s * x[1])
     return (x[0] ** 2 + x[1] ** 2) ** (1 / 3) * ufl.sin(2 * theta / 3 - np.pi / 3)
+
+
+def laplacian(V: fem.FunctionSpace, g: Expr) -> Expr:
+    """Return the Laplace-Beltrami operator of a function of space on a closed surface.
+
+    By the chain rule: that of the coordinates, which are functions of any space, is the vector of mean curvature.
+    """
+    coordinates = [fem.Function(V) for _ in range(V.mesh.gdim)]
+    points = [V.hierarchy.points[l][V.hierarchy.dof_functions(l)] for l in range(V.num_levels)]
+    for function, values in zip(coordinates, np.concatenate(points).T, strict=True):
+        function.x.array = values
+    domain = V.mesh.ufl_domain()
+    tangential = ufl.Jacobian(domain) * ufl.JacobianInverse(domain)
+    curvature = ufl.as_vector([ufl.div(grad(x)) for x in coordinates])
+    return inner(grad(grad(g)), tangential) + ufl.dot(grad(g), curvature)
 
 
 # ---- Solvers

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,6 +21,19 @@ def test_code_for_users_of_dolfinx_runs() -> None:
     uh, flux = names["uh"], names["flux"]
     assert uh.function_space == names["V"]  # type: ignore[attr-defined]  # what the code has made
     assert abs(flux.x.array).max() > 0.1  # type: ignore[attr-defined]  # as above
+
+
+def test_code_of_adaptive_loops_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    section = (ROOT / "docs/adaptivity.md").read_text().split("\n## ")[1]
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
+        exec(block, names)
+    assert "within the tolerance" in names["history"].reason
+    adaptive, uniform = names["films"].values()
+    assert adaptive["H1 error"][-1] < uniform["H1 error"][-1]
+    assert adaptive.rate("H1 error") > 1.3  # 1.5 is that of cubic splines
+    assert (tmp_path / "film.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

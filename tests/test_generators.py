@@ -32,6 +32,7 @@ CLOSED = {
     "torus": generators.torus((5, 3)),
     "cube": generators.cube_sphere(1),
     "cube_sphere": generators.cube_sphere(4),
+    "trapezohedron": generators.trapezohedron(7, 2),
     "genus3_base": generators.genus3(levels=0),
     "genus3": generators.genus3(),
     "cubes": lattice_surface(["##", "#."], ["..", "#."]),
@@ -96,6 +97,7 @@ def same_points(one: npt.ArrayLike, other: npt.ArrayLike) -> bool:
         ("torus", (15, 15, 1), {}),
         ("cube", (8, 6, 0), {3: 8}),
         ("cube_sphere", (98, 96, 0), {3: 8}),
+        ("trapezohedron", (58, 56, 0), {3: 14, 7: 2}),
         ("genus3_base", (44, 48, 3), {8: 4}),
         ("genus3", (3068, 3072, 3), {8: 4}),
         ("cubes", (20, 18, 0), {3: 12, 5: 2, 6: 1}),
@@ -133,6 +135,24 @@ def test_cube_sphere_is_equiangular() -> None:
     np.testing.assert_allclose(np.diff(angles), math.pi / 12, rtol=1e-12)
     assert same_points(mesh.vertices, mesh.vertices[:, [1, 2, 0]])
     assert areas(mesh).min() > 0.6 * areas(mesh).max()
+
+
+@pytest.mark.parametrize("valence", [3, 4, 12])
+def test_trapezohedron_has_two_poles(valence: int) -> None:
+    mesh = generators.trapezohedron(valence, 3)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(mesh.vertices[[0, 16]], [[0, 0, 1], [0, 0, -1]])
+    assert mesh.valences[[0, 16]].tolist() == [valence, valence]
+    turn = np.exp(1j * np.pi / valence)  # and over: so one pole goes to the other
+    x, y, z = mesh.vertices.T
+    turned = (x + 1j * y) * turn
+    assert same_points(mesh.vertices, np.column_stack([turned.real, turned.imag, -z]))
+
+
+def test_trapezohedron_of_valence_3_is_the_cube() -> None:
+    cube, other = generators.cube_sphere(1), generators.trapezohedron(3, 1)
+    gram = [np.sort((mesh.vertices @ mesh.vertices.T).round(12), axis=1) for mesh in (cube, other)]
+    np.testing.assert_allclose(*gram, atol=1e-11)
 
 
 # Implicit surfaces
@@ -435,6 +455,27 @@ def test_interpolated_meshes_keep_what_is_tagged() -> None:
         generators.interpolated(triangle)
 
 
+def test_fitted_limits_lie_on_the_surface() -> None:
+    """Near a vertex of valence 8 to the second order of the size of its rings, the subdominant eigenvalue's powers."""
+    distances = []
+    for times in (3, 4):
+        given = subdivision.subdivided(generators.trapezohedron(8, 1), times)
+        mesh = generators.fitted(given, lambda x: 2.0 * x / np.linalg.norm(x, axis=0))
+        np.testing.assert_allclose(np.linalg.norm(at_corners(mesh), axis=2), 2.0, atol=1e-11)
+        uv = np.random.default_rng(0).random((20 * mesh.num_faces, 2))
+        x = limit.evaluate(mesh, np.repeat(np.arange(mesh.num_faces), 20), uv, derivatives=0)[0]
+        distances.append(np.abs(np.linalg.norm(x, axis=1) - 2.0).max())
+    assert np.log2(distances[0] / distances[1]) == pytest.approx(2 * 0.713, abs=0.1)  # log2(1 / 0.610)
+
+
+def test_fitted_meshes_need_a_point_for_each_vertex() -> None:
+    mesh = generators.cube_sphere(2)
+    with pytest.raises(ValueError, match=r"shape \(26,\) for points of shape \(3, 26\)"):
+        generators.fitted(mesh, lambda x: x[0])
+    with pytest.raises(ValueError, match="all of them finite"):
+        generators.fitted(mesh, lambda x: x * np.nan)
+
+
 # Planar domains
 
 
@@ -609,6 +650,7 @@ MAKERS: dict[str, Callable[..., ControlMesh]] = {
     "ball": lambda **comm: ball(10, smoothing=3, **comm),
     "torus": lambda **comm: generators.torus((4, 3), **comm),
     "cube_sphere": lambda **comm: generators.cube_sphere(1, **comm),
+    "trapezohedron": lambda **comm: generators.trapezohedron(5, 1, **comm),
     "genus3": lambda **comm: generators.genus3(**comm),
     "genus3_base": lambda **comm: generators.genus3(0, **comm),
     "rectangle": lambda **comm: generators.rectangle((1, 1), **comm),
@@ -648,6 +690,8 @@ def test_meshes_are_repeatable(make: Callable[..., ControlMesh]) -> None:
         (lambda make: make.torus((5, 4), r=-1.0), ValueError, r"expected 0 < r < R"),
         (lambda make: make.torus((5, 4), R=math.inf), ValueError, r"both finite"),
         (lambda make: make.cube_sphere(0), ValueError, r"n is 0: expected 1 or more"),
+        (lambda make: make.trapezohedron(2, 1), ValueError, r"valence is 2: expected 3 or more"),
+        (lambda make: make.trapezohedron(5, 1.5), TypeError, r"n is 1.5: expected an integer"),
         (lambda make: make.genus3(-1), ValueError, r"levels is -1: expected 0 or more"),
         (lambda make: make.genus3(True), TypeError, r"levels is True: expected an integer"),
         (lambda make: make.rectangle((0, 1)), ValueError, r"shape\[0\] is 0: expected 1 or more"),

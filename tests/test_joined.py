@@ -17,8 +17,9 @@ from thccs_fem import generators, joined
 from thccs_fem.bezier import bezier_masks
 from thccs_fem.boundary import Boundary, to_dofs
 from thccs_fem.extraction import Cells, extract
-from thccs_fem.hierarchy import Hierarchy, functions_meeting
+from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.joined import Parts, groups, joined_boundaries, joined_levels
+from thccs_fem.regions import functions_meeting
 
 CELLS = ("level", "level_face", "face", "points", "batches", "piece_origin", "piece_axes", "piece_of_face")
 

@@ -12,8 +12,8 @@ LAYERS = """
     thccs_fem.polygons thccs_fem.validation thccs_fem.mesh thccs_fem.positions
     thccs_fem.subdivision thccs_fem.boundary thccs_fem.joined thccs_fem.coarsening thccs_fem.bezier thccs_fem.limit
     thccs_fem.generators
-    thccs_fem.stam thccs_fem.hierarchy thccs_fem.partition thccs_fem.prolongation thccs_fem.extraction thccs_fem.facets
-    thccs_fem.quadrature thccs_fem.folds
+    thccs_fem.stam thccs_fem.regions thccs_fem.hierarchy thccs_fem.partition thccs_fem.prolongation
+    thccs_fem.extraction thccs_fem.facets thccs_fem.quadrature thccs_fem.folds
     thccs_fem.fem.space thccs_fem.fem.function thccs_fem.fem.expression thccs_fem.fem.checks thccs_fem.fem.forms
     thccs_fem.fem.sparsity thccs_fem.fem.loops thccs_fem.fem.mass
     thccs_fem.fem.points thccs_fem.fem.entries thccs_fem.fem.assembly thccs_fem.fem.fitting thccs_fem.fem.bcs
@@ -26,8 +26,10 @@ LAYERS = """
     thccs_fem.fem.petsc.linear thccs_fem.fem.petsc.nonlinear thccs_fem.fem.petsc.eigen
     thccs_fem.fem.petsc.evolution thccs_fem.fem.petsc.timestepping thccs_fem.fem.petsc
     thccs_fem.estimate.indicators thccs_fem.estimate.error thccs_fem.estimate.residual thccs_fem.estimate.bubble
+    thccs_fem.estimate.goal
     thccs_fem.estimate thccs_fem.checkpoint
-    thccs_fem.adapt.marking thccs_fem.adapt.remeshing thccs_fem.adapt.transfer thccs_fem.adapt.loop thccs_fem.adapt
+    thccs_fem.adapt.marking thccs_fem.adapt.prediction thccs_fem.adapt.remeshing thccs_fem.adapt.grading
+    thccs_fem.adapt.transfer thccs_fem.adapt.history thccs_fem.adapt.resuming thccs_fem.adapt.loop thccs_fem.adapt
     thccs_fem.vtk thccs_fem.io thccs_fem.plot
     thccs_fem.dolfinx
 """.split()

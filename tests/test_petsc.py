@@ -591,3 +591,60 @@ def test_values_that_are_not_finite() -> None:
         problem = LinearProblem(u * v * dx, L, petsc_options_prefix="nan_", petsc_options=SOLVERS[name])
         with pytest.raises(RuntimeError, match="not finite"):
             problem.solve()
+
+
+# ---- Where solvers start from
+
+
+def torus_problem(u: fem.Function, options: dict[str, Any]) -> LinearProblem:
+    trial, v, x = arguments(u.function_space)
+    a = inner(grad(trial), grad(v)) * dx + trial * v * dx
+    return LinearProblem(a, x[0] * v * dx, u=u, petsc_options_prefix="guess_", petsc_options=options)
+
+
+@pytest.mark.parametrize("options", [CG, GAMG, {"ksp_type": "gmres", "pc_type": "jacobi", "ksp_rtol": 1e-12}])
+def test_iteration_starts_from_u_if_asked_to(options: dict[str, Any]) -> None:
+    """It ends at the same residual, relative to the right-hand side: a better guess takes fewer iterations."""
+    V = torus()
+    exact = torus_problem(fem.Function(V), MUMPS).solve()
+    iterations, solutions = [], []
+    for part in (0.0, 1.0, 1.0 - 1e-6, 1.0):
+        u = fem.Function(V)
+        u.x.array = part * exact.x.array
+        problem = torus_problem(u, options)
+        if part > 0.0 and len(iterations) != 1:
+            assert problem.start_from_u() is True
+        solutions.append(problem.solve().x.array)
+        iterations.append(problem.solver.getIterationNumber())
+    unasked, better, exactly = iterations[1:]
+    assert unasked == iterations[0]
+    assert better < 0.8 * unasked  # half of the digits are there
+    assert exactly <= 1
+    for solution in solutions:
+        np.testing.assert_allclose(solution, exact.x.array, rtol=0, atol=1e-9 * np.abs(exact.x.array).max())
+
+
+@pytest.mark.parametrize("options", [{}, DIRECT, MUMPS])
+def test_factorisations_start_from_nothing(options: dict[str, Any]) -> None:
+    u = fem.Function(torus())
+    problem = torus_problem(u, options)
+    assert problem.start_from_u() is False
+    u.x.array[:] = 1e9
+    np.testing.assert_array_equal(
+        problem.solve().x.array, torus_problem(fem.Function(torus()), options).solve().x.array
+    )
+
+
+def test_a_chosen_solver_starts_from_u_where_it_iterates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Large systems are expected to be iterated; where that turns out otherwise, no harm is done."""
+    monkeypatch.setattr("thccs_fem.fem.petsc.linear.LARGEST_DIRECT", 10)
+    V = torus()
+    problem = torus_problem(fem.Function(V), {})
+    assert problem.start_from_u() is True
+    expected = problem.solve().x.array.copy()
+    assert problem.solver.getInitialGuessNonzero()
+    monkeypatch.setattr("thccs_fem.fem.petsc.linear.LARGEST_DIRECT", 10**9)
+    other = torus_problem(fem.Function(V), {})
+    other.solver.setInitialGuessNonzero(True)
+    np.testing.assert_allclose(other.solve().x.array, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+    assert not other.solver.getInitialGuessNonzero()

@@ -42,8 +42,8 @@ CASES = [(name, "crease") for name in PLACES] + [("wheel5", "clamped"), ("l_doma
 
 
 @functools.cache
-def beginning(name: str, boundary: str) -> Hierarchy:
-    return Hierarchy.on(PLACES[name], boundary)
+def beginning(name: str, boundary: str, admissibility: int | None = None, unit: str = "support") -> Hierarchy:
+    return Hierarchy.on(PLACES[name], boundary, admissibility=admissibility, unit=unit)
 
 
 def cells_of(hierarchy: Hierarchy) -> list[Cell]:
@@ -65,6 +65,32 @@ def support_of(stage: Stage, vertex: int) -> npt.NDArray[np.bool_]:
     return np.isin(stage.level.quads, stage.level.quads[at]).any(axis=1)
 
 
+def ring_of(stage: Stage, vertex: int) -> npt.NDArray[np.bool_]:
+    """The faces at a vertex."""
+    return (stage.level.quads == vertex).any(axis=1)
+
+
+def taken_by(hierarchy: Hierarchy, dof: int) -> tuple[int, npt.NDArray[np.int64]]:
+    """The level of a dof and the keys of the faces that refining it takes, by the letter (crease boundary)."""
+    l = int(np.searchsorted(hierarchy.dof_offsets, dof, side="right")) - 1
+    stage = hierarchy.stages[l]
+    vertex = int(hierarchy.dof_functions(l)[dof - hierarchy.dof_offsets[l]])
+    faces = ring_of(stage, vertex)
+    if hierarchy.unit == "support" or not (faces & ~stage.refined).any():
+        faces = support_of(stage, vertex)
+    return l, stage.level.keys[faces]
+
+
+def levels_on_cells(cells: Cells) -> npt.NDArray[np.int64]:
+    """How many levels lie between that of a cell and the coarsest of a function on it, both counted, (num_cells,)."""
+    level_of_dof = np.repeat(np.arange(cells.hierarchy.num_levels), np.diff(cells.hierarchy.dof_offsets))
+    coarsest = np.zeros(cells.num_cells, dtype=int)
+    for batch in cells.batches:
+        levels = np.where(batch.dofs >= 0, level_of_dof[batch.dofs], cells.hierarchy.num_levels)
+        coarsest[batch.cells] = levels.min(axis=1)
+    return cells.level - coarsest + 1
+
+
 # ---- Any sequence of refining and coarsening
 
 
@@ -73,9 +99,13 @@ class Remeshing(RuleBasedStateMachine):
 
     hierarchy: Hierarchy
 
-    @initialize(case=st.sampled_from(CASES))
-    def start(self, case: tuple[str, str]) -> None:
-        self.hierarchy = beginning(*case)
+    @initialize(
+        case=st.sampled_from(CASES),
+        admissibility=st.sampled_from([None, 2, 3]),
+        unit=st.sampled_from(["support", "ring"]),
+    )
+    def start(self, case: tuple[str, str], admissibility: int | None, unit: str) -> None:
+        self.hierarchy = beginning(*case, admissibility, unit)
 
     def marked(self, seed: int, share: float) -> npt.NDArray[np.int64]:
         """Some cells, those that are near in number together, as faces near each other often are."""
@@ -116,13 +146,21 @@ class Remeshing(RuleBasedStateMachine):
         before, dofs = self.hierarchy, self.functions(choices)
         after = before.remeshed(dofs, self.marked(seed, share))
         assert before.refined(dofs).is_refinement_of(after)
-        for l, support in enumerate(before.support(dofs)):
-            if support.any():
-                assert np.isin(before.stages[l].level.keys[support], after.refined_keys[l]).all()
+        if before.rule == "crease":
+            for dof in dofs:
+                l, taken = taken_by(before, dof)
+                assert np.isin(taken, after.refined_keys[l]).all()
         self.hierarchy = after
 
     @invariant()
-    def regions_are_nested_unions_of_supports(self) -> None:
+    def the_rules_of_refinement_stay(self) -> None:
+        assert self.hierarchy.root is self.hierarchy.stages[0].level
+        admissibility = self.hierarchy.admissibility
+        if admissibility is not None:
+            assert levels_on_cells(extract(self.hierarchy)).max() <= admissibility
+
+    @invariant()
+    def regions_are_nested_unions_of_units(self) -> None:
         for l, keys in enumerate(self.hierarchy.refined_keys):
             stage = self.hierarchy.stages[l]
             assert not (stage.refined & ~stage.inside).any()
@@ -131,7 +169,12 @@ class Remeshing(RuleBasedStateMachine):
             for vertex in np.flatnonzero((stage.selected & ~stage.active)[: stage.level.num_vertices]):
                 covered |= support_of(stage, vertex)
             assert not (covered & ~stage.refined).any()
-            if self.hierarchy.rule == "crease":  # traces bring faces too
+            if self.hierarchy.unit == "ring":
+                for vertex in range(stage.level.num_vertices):
+                    ring = ring_of(stage, vertex)
+                    if stage.refined[ring].all():
+                        covered |= ring
+            if self.hierarchy.rule == "crease" or self.hierarchy.unit == "ring":  # traces bring faces too
                 missing = set(stage.level.keys[stage.refined & ~covered].tolist())
                 assert missing <= (along(self.hierarchy) if l == 0 else set())
 
@@ -157,7 +200,25 @@ def independence(cells: Cells) -> float:
     return scaled_eigenvalue((rows.T @ mass @ rows).toarray())
 
 
-Remeshing.TestCase.settings = settings(max_examples=15, stateful_step_count=6, deadline=None)
+def test_what_is_refined_on_a_face_that_is_refined_along_goes_level_by_level() -> None:
+    """The ring of a face point is one face of level 0, which may be one that no ring has brought by itself."""
+    coarse = beginning("tripod", "crease", None, "ring")
+    face = min(along(coarse))
+    hierarchy = coarse.refined(coarse.root.quads[face])
+    (dof,) = (
+        dof
+        for dof in range(hierarchy.dof_offsets[1], hierarchy.num_dofs)
+        if set(taken_by(hierarchy, dof)[1] // 4) == {face}
+    )
+    hierarchy = hierarchy.refined(np.array([dof]))
+    assert hierarchy.num_levels == 3
+    for levels in (2, 1):
+        hierarchy = hierarchy.coarsened(np.arange(len(cells_of(hierarchy))))
+        assert hierarchy.num_levels == levels
+        assert abs(bernstein_rows(extract(hierarchy)).sum(axis=1) - 1.0).max() < EXACT
+
+
+Remeshing.TestCase.settings = settings(max_examples=30, stateful_step_count=6, deadline=None)
 TestRemeshing = Remeshing.TestCase
 
 

@@ -353,7 +353,9 @@ def _put_spaces(file: h5py.File, functions: list[Function]) -> list[Space]:
             group.attrs["hierarchy"] = list(map(V.hierarchy.same_as, hierarchies)).index(True)
     for number, hierarchy in enumerate(hierarchies):
         group = file.create_group(f"hierarchies/{number}")
-        group.attrs.update({"rule": hierarchy.rule, "cap_level": hierarchy.cap_level})
+        group.attrs.update({"rule": hierarchy.rule, "cap_level": hierarchy.cap_level, "unit": hierarchy.unit})
+        if hierarchy.admissibility is not None:
+            group.attrs["admissibility"] = hierarchy.admissibility
         for level, keys in enumerate(hierarchy.refined_keys):
             group[str(level)] = keys
     return spaces
@@ -364,8 +366,17 @@ def _spaces_of(file: h5py.File, mesh: ControlMesh) -> list[Space]:
     hierarchies = []
     for group in _members(file["hierarchies"]) if "hierarchies" in file else []:
         keys = [level[()] for level in _members(group)]
-        cap_level = int(group.attrs["cap_level"])
-        hierarchies.append(Hierarchy.on(mesh, group.attrs["rule"], cap_level=cap_level, refined_keys=keys))
+        admissibility = group.attrs.get("admissibility")  # older files have neither this nor a unit
+        hierarchies.append(
+            Hierarchy.on(
+                mesh,
+                group.attrs["rule"],
+                cap_level=int(group.attrs["cap_level"]),
+                admissibility=None if admissibility is None else int(admissibility),
+                unit=group.attrs.get("unit", "support"),
+                refined_keys=keys,
+            )
+        )
     spaces: list[Space] = []
     for group in _members(file["spaces"]):
         shape = tuple(group.attrs["value_shape"].tolist())

@@ -158,13 +158,15 @@ class Cells:
             local = pieces[mine] - start
             dofs = batch.dofs[np.searchsorted(batch.offsets, local, side="right") - 1]
             if batch.operators is None:
-                operators = np.broadcast_to(np.eye(16), (mine.size, 16, 16))
+                row.append((16 * mine[:, None] + np.arange(16)).ravel())
+                column.append(dofs.ravel())
+                value.append(np.ones(dofs.size))
             else:
                 operators = batch.operators[local]
-            i, j, k = np.nonzero((dofs >= 0)[:, None, :] & (operators != 0.0))
-            row.append(16 * mine[i] + j)
-            column.append(dofs[i, k])
-            value.append(operators[i, j, k])
+                i, j, k = np.nonzero(operators)  # padding is zero
+                row.append(16 * mine[i] + j)
+                column.append(dofs[i, k])
+                value.append(operators[i, j, k])
         return summed(list(zip(row, column, value, strict=True)), (16 * pieces.size, self.num_dofs))
 
     @cached_property

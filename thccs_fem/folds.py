@@ -2,7 +2,8 @@
 
 On a folded map |det J| hides the sign and the patch test fails by 1e-2 whatever the depth; a mesh that folds is refused
 by name.  With plain masks a corner with two or more faces folds where its angle exceeds 90 degrees a face, but only
-some levels below the control mesh, so the faces there are followed down to FOLD_LEVEL.
+some levels below the control mesh, so the faces there are followed down to FOLD_LEVEL.  After two or three levels the
+faces around a corner are connected as those a level above: from then on one matrix takes points to those of the next.
 """
 
 from __future__ import annotations
@@ -63,16 +64,26 @@ def _check_tagged_corners(cells: Cells) -> None:
     hierarchy = cells.hierarchy
     level, points = hierarchy.root, hierarchy.points[0]
     watched = level.corner & (level.vertex_num_faces > 1)
-    while watched.any() and level.number < FOLD_LEVEL:
-        step = subdivide(level, neighbourhood(level, level.touching(watched)))
+    number, repeats = level.number, False
+    found: list[tuple[Level, Ints, Floats]] = []
+    while watched.any() and number < FOLD_LEVEL:
+        if not repeats:
+            step = subdivide(level, neighbourhood(level, level.touching(watched)))
+            inherited = _inherited(step.old, watched, step.fine)
+            repeats = _is_alike(level, step.fine) and np.array_equal(watched, inherited)
+            level, watched = step.fine, inherited
+            faces: Ints = np.flatnonzero(level.touching(watched)).astype(np.int32)
+            masks = bezier_masks(Boundary.of(level, "crease"), faces)
+        number += 1
         points = step.matrix @ points
-        watched = _inherited(step.old, watched, step.fine)
-        level = step.fine
-        faces: Ints = np.flatnonzero(level.touching(watched)).astype(np.int32)
-        masks = bezier_masks(Boundary.of(level, "crease"), faces)
-        folded = faces[_folds((masks @ points).reshape(-1, 16, 2))]
-        if folded.size:
-            _refuse(cells, level, folded)
+        found.append((level, faces, (masks @ points).reshape(-1, 16, 2)))
+    if not found:
+        return
+    levels, of_levels, patches = zip(*found, strict=True)
+    folds = np.split(_folds(np.concatenate(patches)), np.cumsum([faces.size for faces in of_levels])[:-1])
+    for number, (level, faces, marks) in enumerate(zip(levels, of_levels, folds, strict=True), 1):
+        if marks.any():
+            _refuse(cells, level, faces[marks], number)
 
 
 def _inherited(old: Ints, watched: npt.NDArray[np.bool_], fine: Level) -> npt.NDArray[np.bool_]:
@@ -81,13 +92,20 @@ def _inherited(old: Ints, watched: npt.NDArray[np.bool_], fine: Level) -> npt.ND
     return marks
 
 
-def _refuse(cells: Cells, level: Level, folded: Ints) -> None:
+def _is_alike(level: Level, fine: Level) -> bool:
+    """Return whether two levels are connected in the same way, vertex by vertex, so that S is the same for both."""
+    names = ("vertices", "twins", "vertex_num_faces", "boundary", "corner")
+    return all(np.array_equal(getattr(level, name), getattr(fine, name)) for name in names)
+
+
+def _refuse(cells: Cells, level: Level, folded: Ints, number: int) -> None:
+    """Raise, for faces of a level or, where corners are alike, of a finer one of the given number."""
     hierarchy = cells.hierarchy
     faces = np.unique(hierarchy.face_of_root[level.keys[folded] >> (2 * level.number)])
     control = level.control_vertex[level.quads[folded]]
     corner = int(control[control >= 0][0])
     raise ValueError(
-        f"the planar surface folds (det J <= 0) at level {level.number} at the tagged corner, vertex {corner} with "
+        f"the planar surface folds (det J <= 0) at level {number} at the tagged corner, vertex {corner} with "
         f"{level.vertex_num_faces[level.control_vertex == corner][0]} faces, on faces {faces[:SHOWN].tolist()}: plain "
         f"masks "
         f"span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the spacing "

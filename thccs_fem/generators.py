@@ -7,7 +7,7 @@ counter-clockwise, those of closed surfaces have their normals outward.
 
 Vertices are control points: where a surface or a rim is curved, the limit lies off them, nearer by
 a factor of four with each doubling of the counts. `interpolated` moves them so that it passes
-through where they were.
+through where they were, `fitted` so that it comes near to any surface.
 """
 
 import itertools
@@ -33,6 +33,7 @@ __all__ = [
     "cube_sphere",
     "cylinder",
     "disc",
+    "fitted",
     "genus3",
     "hemisphere",
     "implicit_surface",
@@ -43,6 +44,7 @@ __all__ = [
     "rectangle",
     "spherical_zone",
     "torus",
+    "trapezohedron",
     "wheel",
 ]
 
@@ -118,6 +120,39 @@ def cube_sphere(n: int, *, comm: Any = None) -> ControlMesh:
     back = np.stack([-np.ones_like(u), v, u], axis=-1)
     sides = [np.roll(side, axis, axis=-1) for side in (front, back) for axis in range(3)]
     vertices, faces = _joined(sides)
+    return ControlMesh(vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces, comm=comm)
+
+
+def trapezohedron(valence: int, n: int, *, comm: Any = None) -> ControlMesh:
+    """Make a sphere with two poles of any valence: 2 valence kites between them, of n x n faces each.
+
+    The poles are vertices 0 and (n + 1)^2; where kites meet around the equator there are 2 valence extraordinary
+    vertices more, of valence 3. The vertices lie on the unit sphere. With valence 3 it is a cube on one of its corners.
+
+    Args:
+        valence: Faces at either pole, three or more.
+        n: Faces along an edge of a kite, one or more.
+        comm: MPI communicator of the mesh.
+
+    Raises:
+        TypeError: An argument is not an integer.
+        ValueError: valence is less than 3 or n is less than 1.
+
+    >>> sorted(trapezohedron(5, 2).extraordinary_vertices.values())
+    [3, 3, 3, 3, 3, 3, 3, 3, 3, 3, 5, 5]
+    """
+    _check_count("valence", valence, minimum=3)
+    _check_count("n", n, minimum=1)
+    # Up and down in turn around the equator, as high as those of the cube if there are six.
+    z = np.resize([1.0, -1.0], 2 * valence) / valence
+    angles, radius = _angles(2 * valence), math.sqrt(1.0 - 1.0 / valence**2)
+    belt = np.column_stack([radius * np.cos(angles), radius * np.sin(angles), z])
+    top, bottom = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+    blocks = []
+    for k in range(0, 2 * valence, 2):
+        a, b, c, d = belt[np.arange(k, k + 4) % (2 * valence)]
+        blocks += [_bilinear([top, a, b, c], n, n), _bilinear([bottom, d, c, b], n, n)]
+    vertices, faces = _joined(blocks)
     return ControlMesh(vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces, comm=comm)
 
 
@@ -498,13 +533,55 @@ def interpolated(mesh: ControlMesh) -> ControlMesh:
     >>> round(float(np.hypot(*ring.vertices[0, :2])), 4)  # outside of the circle: 3 / (2 + cos(2 pi / 12))
     1.0467
     """
-    quads = mesh.quads
-    _, first = np.unique(quads, return_index=True)
+    return _with_limits(mesh, mesh.vertices)
+
+
+def fitted(mesh: ControlMesh, closest: Callable[[Floats], npt.ArrayLike]) -> ControlMesh:
+    """Return the mesh whose limit surface meets a given surface: the limits of its vertices are moved onto that.
+
+    Between them it is as near as `interpolated`; at extraordinary vertices it is off by the second order of the size of
+    the faces there. A mesh that was subdivided has no kinks in its lines: its vertices make a better fit than points
+    that are placed block by block.
+
+    Args:
+        mesh: A mesh of quads. Tags, creases and corners are kept.
+        closest: Takes points x of shape (gdim, m), returns points on the surface near them, of the same shape.
+
+    Raises:
+        ValueError: A face is no quad, or what is returned has another shape or is not finite.
+        NotImplementedError: The mesh has creases inside, or corners that are semi-sharp or inside.
+
+    >>> sphere = fitted(subdivided(cube_sphere(1), 3), lambda x: x / np.linalg.norm(x, axis=0))
+    >>> sphere
+    ControlMesh(gdim=3, num_vertices=386, num_edges=768, num_faces=384)
+    """
+    limits = (_limits_of_vertices(mesh) @ mesh.vertices).T
+    return _with_limits(mesh, together(mesh.comm, lambda: _moved(limits, closest)).T)
+
+
+def _moved(points: Floats, closest: Callable[[Floats], npt.ArrayLike]) -> Floats:
+    """Return what `closest` makes of points, shape (gdim, m)."""
+    found = np.asarray(closest(points), dtype=np.float64)
+    if found.shape != points.shape or not np.isfinite(found).all():
+        raise ValueError(
+            f"closest returned an array of shape {found.shape} for points of shape {points.shape}, of finite numbers "
+            f"{np.count_nonzero(np.isfinite(found))}: expected as many points, all of them finite"
+        )
+    return found
+
+
+def _with_limits(mesh: ControlMesh, points: Floats) -> ControlMesh:
+    """Return the mesh with the limits of its vertices at the given points, shape (num_vertices, gdim)."""
+    vertices = spsolve(_limits_of_vertices(mesh).tocsc(), points)
+    return ControlMesh(vertices, mesh.quads, mesh.face_tags, mesh.edge_tags, mesh.creases, mesh.corners, comm=mesh.comm)
+
+
+def _limits_of_vertices(mesh: ControlMesh) -> sp.csr_array:
+    """Return the weights of the limit point of each vertex, shape (num_vertices, num_vertices)."""
+    _, first = np.unique(mesh.quads, return_index=True)
     faces, k = np.divmod(first.astype(np.int32), 4)
     masks = bezier_masks(Boundary.of(control_level(mesh), "crease"), faces)
-    limits = sp.csr_array(masks[16 * np.arange(k.size) + VERTEX_PLACE[k]])
-    vertices = spsolve(limits.tocsc(), mesh.vertices)
-    return ControlMesh(vertices, quads, mesh.face_tags, mesh.edge_tags, mesh.creases, mesh.corners, comm=mesh.comm)
+    return sp.csr_array(masks[16 * np.arange(k.size) + VERTEX_PLACE[k]])
 
 
 # Planar domains

@@ -16,6 +16,8 @@ Faces with an irregular vertex that are not refined are cut by the same subdivis
 extraordinary vertex (`cap_levels`), where a bicubic cap ends the cut.  Cut faces ride along in the levels: functions
 outside of Omega^{l+1} keep their untruncated rows in C_{l+1}, so the same matrices give the pieces of cut faces.
 
+What is refined is made of units, supports or rings, and may close so that few levels meet on a cell (`regions`).
+
 What is refined or coarsened shares all stages in which nothing changes with the hierarchy that it comes from.  Others
 are made together (`joined`), so that work grows with what changes and not with the number of levels.
 """
@@ -26,7 +28,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -36,13 +38,12 @@ from thccs_fem.boundary import (
     Boundary,
     BoundaryRule,
     subdivision_matrix,
-    support_of_traces,
     to_dofs,
-    traces_meeting,
 )
 from thccs_fem.joined import Parts, groups, joined_levels
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.positions import in_quads, in_sub_quads
+from thccs_fem.regions import Unit, cover, faces_meeting, functions_meeting, refined_by, required
 from thccs_fem.sparse import COMPUTED, EMPTY, csr, product, rows_of, stacked
 from thccs_fem.subdivision import (
     Bools,
@@ -57,8 +58,10 @@ from thccs_fem.subdivision import (
     with_matrix,
 )
 
-__all__ = ["CAP_LEVEL", "Hierarchy", "Stage", "faces_meeting", "functions_meeting"]
+__all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
 
+UNITS = get_args(Unit)
+NO_MATRIX = sp.csr_array((0, 0))
 CAP_LEVEL = 4  # level at which the bicubic cap ends the cut at an irregular vertex, unless refinement goes deeper
 
 Keys = npt.NDArray[np.int64]
@@ -92,6 +95,11 @@ class Stage:
     active: Bools
 
     @property
+    def is_whole(self) -> bool:
+        """Whether it has all that it needs: stages of an outline have no matrix."""
+        return self.step is None or self.matrix is not None
+
+    @property
     def active_faces(self) -> Ints:
         """Active elements of this level: faces inside Omega^l and outside Omega^{l+1}."""
         return np.flatnonzero(self.inside & ~self.refined).astype(np.int32)
@@ -105,17 +113,23 @@ class Hierarchy:
         mesh: The control mesh.
         rule: "clamped" or "crease".
         cap_level: Least cap level.
+        admissibility: How many successive levels may meet on a cell, 2 or more; None: any number.
+        unit: What refining a function refines: its "support", or the "ring" of faces at its vertex.
         refined_keys: Keys of the faces of Omega^{l+1} for each level l, ascending.
         root: Level 0: the control mesh, or its first subdivision where `user_face_of_root` says so.
         stages: One for each level, the coarsest first.
+        is_outline: Whether refinements have no subdivision matrices.
     """
 
     mesh: ControlMesh
     rule: BoundaryRule
     cap_level: int
+    admissibility: int | None
+    unit: Unit
     refined_keys: tuple[Keys, ...]
     root: Level
     stages: tuple[Stage, ...]
+    is_outline: bool = False
 
     @classmethod
     def on(
@@ -124,36 +138,40 @@ class Hierarchy:
         rule: BoundaryRule = "clamped",
         *,
         cap_level: int = CAP_LEVEL,
+        admissibility: int | None = None,
+        unit: Unit = "support",
         refined_keys: Sequence[Keys] = (),
     ) -> Self:
         """Return the hierarchy of a mesh with nothing refined, or with the `refined_keys` of one that was there before.
 
         A mesh with polygons other than quads, or one whose level-0 functions are dependent, is subdivided once.
+
+        Raises:
+            ValueError: If an option is out of range, or the keys are not those of an admissible hierarchy of the class.
         """
         _check_cap_level(cap_level)
+        _check_admissibility(admissibility)
+        if unit not in UNITS:
+            raise ValueError(f'unit is {unit!r}; what is refined with a function must be its "support" or its "ring"')
         root = control_level(mesh)
         if not root.is_quad or _is_dependent(root):
             root = _as_level_zero(subdivide(root, np.ones(root.num_faces, dtype=bool)).fine)
-        return cls._build(mesh, rule, cap_level, refined_keys, root)
+        made = cls(mesh, rule, cap_level, admissibility, unit, (), root, ())._with(refined_keys)
+        if not made._is_closed():
+            raise ValueError(
+                f"the refined_keys are not those of an admissible hierarchy of class {admissibility}: give those of "
+                f"one that was refined with this class or a smaller one, or admissibility=None"
+            )
+        return made
 
-    @classmethod
-    def _build(
-        cls,
-        mesh: ControlMesh,
-        rule: BoundaryRule,
-        cap_level: int,
-        refined_keys: Sequence[Keys],
-        root: Level,
-        known: Sequence[Stage] = (),
-    ) -> Self:
-        keys = tuple(k for k in refined_keys if k.size)
-        caps = _cap_levels(root, keys, cap_level)
-        _check_depth(root, max(int(caps.max()), len(keys)))
-        return cls(mesh, rule, cap_level, keys, root, tuple(_stages(root, rule, keys, caps, known)))
-
-    def _with(self, refined_keys: Sequence[Keys], cap_level: int) -> Self:
+    def _with(self, refined_keys: Sequence[Keys], cap_level: int | None = None) -> Self:
         """Return the hierarchy with other faces refined; it shares the stages in which nothing changes."""
-        return self._build(self.mesh, self.rule, cap_level, refined_keys, self.root, self.stages)
+        keys = tuple(k for k in refined_keys if k.size)
+        least = self.cap_level if cap_level is None else cap_level
+        caps = _cap_levels(self.root, keys, least)
+        _check_depth(self.root, max(int(caps.max()), len(keys)))
+        stages = tuple(_stages(self.root, self.rule, keys, caps, self.stages, self.is_outline))
+        return replace(self, cap_level=least, refined_keys=keys, stages=stages)
 
     @property
     def num_levels(self) -> int:
@@ -228,22 +246,35 @@ class Hierarchy:
         return tuple(faces_meeting(stage.boundary, marks) for stage, marks in zip(self.stages, functions, strict=False))
 
     def refined(self, dofs: npt.NDArray[np.integer]) -> Self:
-        """Return the hierarchy in which the supports of the given dofs are refined once more (sec. 4.1).
+        """Return the hierarchy in which the units of the given dofs are refined once more (sec. 4.1).
 
-        With them the faces of level 0 on which functions are dependent, lest these be all that is left of level 0.
+        With them what the hierarchy's class asks for (`regions.required`), and the faces of level 0 on which functions
+        are dependent, lest these be all that is left of level 0.
 
         Args:
             dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
         """
         return self.remeshed(dofs, np.zeros(0, dtype=np.int64))
 
+    def outlined(self) -> Self:
+        """Return this hierarchy as one whose refinements are outlines: cells and active functions, but no matrices.
+
+        They take half the time, and tell what can be refined next.
+        """
+        return replace(self, is_outline=True)
+
+    def completed(self) -> Self:
+        """Return the whole hierarchy of an outline."""
+        return replace(self, is_outline=False)._with(self.refined_keys)
+
     def coarsened(self, cells: npt.NDArray[np.integer]) -> Self:
         """Return the hierarchy in which the given cells are coarsened by one level, where whole functions allow it.
 
         A face of Omega^{l+1} is free if its four children are cells, and given. What is left of Omega^{l+1} is the
-        union of the supports without free faces, and for each other face that is not free one support more, that with
-        the fewest free faces. So cells that are not given stay (but the faces of level 0 that are refined along with
-        others go with the last of them), and ``refined(dofs)`` is undone when the cells that it made are given.
+        union of the units without free faces, and for each other face that is not free one unit more, that with the
+        fewest free faces; faces that the class needs, for finer ones that stay, are not free. So cells that are not
+        given stay (but the faces of level 0 that are refined along with others go with the last of them), and
+        ``refined(dofs)`` is undone when the cells that it made are given.
 
         Args:
             cells: Active elements, numbers in 0 .. number of cells, shape (n,).
@@ -254,26 +285,52 @@ class Hierarchy:
         return self.remeshed(np.zeros(0, dtype=np.int64), cells)
 
     def remeshed(self, dofs: npt.NDArray[np.integer], cells: npt.NDArray[np.integer]) -> Self:
-        """Return the hierarchy with supports of dofs `refined`, and cells `coarsened` where that undoes none of it.
+        """Return the hierarchy with units of dofs `refined`, and cells `coarsened` where that undoes none of it.
 
         Args:
             dofs: Active functions, numbers in 0 .. num_dofs, shape (n,).
             cells: Active elements, numbers in 0 .. number of cells, shape (m,).
         """
         stages = self.stages[: self.num_levels]
-        supports = self.support(dofs)
-        spare = [marks & ~support for marks, support in zip(self._marks_of(cells), supports, strict=True)]
-        keys = []
-        for l, (stage, support) in enumerate(zip(stages, supports, strict=True)):
-            refined = stage.refined | support
-            free = _with_all_children(stage, spare[l + 1]) & ~support if l + 1 < len(stages) else ~refined
+        wanted = self._units(dofs)
+        marked = self._marks_of(cells)
+        keys: list[Keys] = []
+        for l in range(len(stages) - 1, -1, -1):  # finer levels ask for coarser ones
+            stage = stages[l]
+            refined = stage.refined | wanted[l]
+            free = ~refined
+            if l + 1 < len(stages):
+                free = _with_all_children(stage, marked[l + 1] & ~wanted[l + 1]) & ~wanted[l]
             along = stage.level.dependent_faces if l == 0 else np.zeros_like(refined)
             kept = refined & (~free | along)
-            cover = _cover(stage, kept & ~along, kept, refined)
-            keys.append(stage.level.keys[cover | (along & cover.any())])
+            region = refined  # if nothing is to go
+            if (refined & free).any():
+                region = cover(stage.boundary, stage.selected, kept & ~along, kept, refined, self.unit)
+            if region.any() or _are_needed(along, [*keys[:1], *self.refined_keys[1:2]]):
+                region |= along
+            keys.insert(0, stage.level.keys[region])
+            coarser = l + 1 - self.admissibility if self.admissibility is not None else -1
+            if coarser >= 0:  # what was refined before has what it needs, unless that is to be coarsened
+                faces = region if cells.size else region & ~stage.refined
+                wanted[coarser] |= required(stage.level, faces, stages[coarser].boundary)
         if _same_keys(keys, self.refined_keys):
             return self
-        return self._with(keys, self.cap_level)
+        return self._with(keys)
+
+    def _units(self, dofs: npt.NDArray[np.integer]) -> list[Bools]:
+        """Return, for each level, the faces that refining those given dofs that belong to the level refines."""
+        return [
+            refined_by(stage.boundary, marks, stage.refined, self.unit)
+            for stage, marks in zip(self.stages, self._functions_of(dofs), strict=False)
+        ]
+
+    def _is_closed(self) -> bool:
+        """Return whether all is refined that the class asks for."""
+        if self.admissibility is None:
+            return True
+        stages = self.stages[: self.num_levels]
+        pairs = zip(stages[self.admissibility - 1 :], stages, strict=False)
+        return not any((required(s.level, s.refined, coarse.boundary) & ~coarse.refined).any() for s, coarse in pairs)
 
     def _marks_of(self, cells: npt.NDArray[np.integer]) -> list[Bools]:
         """Return marks of the given cells on the faces of each level."""
@@ -291,6 +348,8 @@ class Hierarchy:
     def common_refinement(self, other: Hierarchy) -> Self:
         """Return the coarsest hierarchy that refines this one and another one.
 
+        It is this hierarchy itself, if that is one; else it has the weaker one of their classes, and rings if one has.
+
         Raises:
             ValueError: If the other has another control mesh, boundary rule or least cap level.
         """
@@ -305,7 +364,10 @@ class Hierarchy:
         keys = [np.union1d(ours, theirs) for ours, theirs in pairs]
         if _same_keys(keys, self.refined_keys):
             return self
-        return self._with(keys, self.cap_level)
+        ours, theirs = self.admissibility, other.admissibility
+        weaker = None if ours is None or theirs is None else max(ours, theirs)
+        unit: Unit = "ring" if "ring" in (self.unit, other.unit) else "support"
+        return replace(self, admissibility=weaker, unit=unit)._with(keys)
 
     def with_caps_at(self, cap_level: int) -> Self:
         """Return the hierarchy with another least cap level; the dofs stay as they are.
@@ -320,7 +382,7 @@ class Hierarchy:
         """Return the hierarchy with Omega^num_levels and everything finer emptied; num_levels is 1 or more."""
         if num_levels < 1:
             raise ValueError(f"num_levels is {num_levels}; level 0 is always there: give 1 or more")
-        return self._with(self.refined_keys[: num_levels - 1], self.cap_level)
+        return self._with(self.refined_keys[: num_levels - 1])
 
     def is_refinement_of(self, other: Hierarchy) -> bool:
         """Return whether every function of `other` is a function of this hierarchy."""
@@ -391,6 +453,14 @@ def _check_cap_level(cap_level: int) -> None:
         raise ValueError(f"cap_level is {cap_level}; a cap needs at least one cut: give 1 or more")
 
 
+def _check_admissibility(admissibility: int | None) -> None:
+    if admissibility is not None and admissibility < 2:
+        raise ValueError(
+            f"admissibility is {admissibility}; where refinement ends two levels meet: give 2 or more, or None for any "
+            f"number of levels on a cell"
+        )
+
+
 def _check_depth(root: Level, deepest: int) -> None:
     if root.num_faces * 4**deepest >= 2**62:
         raise ValueError(
@@ -432,9 +502,14 @@ class _Outline:
 
 
 def _stages(
-    root: Level, rule: BoundaryRule, refined_keys: Sequence[Keys], caps: Ints, known: Sequence[Stage]
+    root: Level,
+    rule: BoundaryRule,
+    refined_keys: Sequence[Keys],
+    caps: Ints,
+    known: Sequence[Stage],
+    is_outline: bool = False,
 ) -> list[Stage]:
-    """Return the stages from level 0 to that of the deepest piece.
+    """Return the stages from level 0 to that of the deepest piece; those of an outline have no matrices.
 
     Which faces a level has determines all of it, whatever coarser levels hold beside them: its vertices stand in the
     order of coarser vertices, edges and faces, and all faces at an edge that matters are there, being neighbours of one
@@ -450,9 +525,10 @@ def _stages(
         refined = _with_keys(level, keys) & inside
         cut = held & ~refined & _needs_cut(level, caps)
         outline = _outline(level, inside, refined, cut, before)
-        outlines.append(before if before is not None and outline.is_of(before) else outline)
+        is_known = before is not None and outline.is_of(before) and (is_outline or before.is_whole)
+        outlines.append(before if before is not None and is_known else outline)
         if outline.children is None:
-            return _with_functions(outlines, rule)
+            return _with_functions(outlines, rule, is_outline)
         inside, held = (outline.children.marks_of(faces) for faces in (refined, refined | cut))
         level = outline.children.fine
 
@@ -472,15 +548,15 @@ def _outline(level: Level, inside: Bools, refined: Bools, cut: Bools, before: St
     return _Outline(level, inside, refined, cut, divided, children(level, divided, fine))
 
 
-def _with_functions(outlines: Sequence[_Outline | Stage], rule: BoundaryRule) -> list[Stage]:
+def _with_functions(outlines: Sequence[_Outline | Stage], rule: BoundaryRule, is_outline: bool) -> list[Stage]:
     """Return the stages of outlines, among stages that stay as they are."""
     unknown = [outline for outline in outlines if isinstance(outline, _Outline)]
     sizes = [outline.level.num_faces for outline in unknown]
-    made = iter([stage for group in groups(sizes) for stage in _made(unknown[group], rule)])
+    made = iter([stage for group in groups(sizes) for stage in _made(unknown[group], rule, is_outline)])
     return [next(made) if isinstance(outline, _Outline) else outline for outline in outlines]
 
 
-def _made(outlines: Sequence[_Outline], rule: BoundaryRule) -> list[Stage]:
+def _made(outlines: Sequence[_Outline], rule: BoundaryRule, is_outline: bool) -> list[Stage]:
     """Return the stages of outlines, all at once."""
     inside, refined, divided = (
         np.concatenate([getattr(outline, name) for outline in outlines]) for name in ("inside", "refined", "divided")
@@ -494,12 +570,18 @@ def _made(outlines: Sequence[_Outline], rule: BoundaryRule) -> list[Stage]:
     found = zip(
         outlines,
         vertices.split_boundary(boundary, levels),
-        _steps(outlines, rule, boundary, divided, vertices),
+        _bare_steps(outlines) if is_outline else _steps(outlines, rule, boundary, divided, vertices),
         functions.split(selected),
         functions.split(active),
         strict=True,
     )
     return [Stage(o.level, traces, o.inside, o.refined, o.cut, *step, *marks) for o, traces, step, *marks in found]
+
+
+def _bare_steps(outlines: Sequence[_Outline]) -> list[tuple[Step | None, None]]:
+    """Return the step of each level without S; for `_made`."""
+    made = [outline.children for outline in outlines]
+    return [(Step(m.fine, m.first_child, m.old, m.edges, NO_MATRIX) if m else None, None) for m in made]
 
 
 def _steps(
@@ -544,23 +626,9 @@ def _needs_cut(level: Level, caps: Ints) -> Bools:
     return level.touching(ends_later)
 
 
-def functions_meeting(boundary: Boundary, faces: Bools) -> Bools:
-    """Return the functions whose support meets the marked faces, shape (num_functions,).
-
-    The support of a vertex's function are the faces that touch a face of the vertex; that of a trace is smaller.
-    """
-    level = boundary.level
-    vertices = level.corners_of(neighbourhood(level, faces))
-    return np.concatenate([vertices, traces_meeting(boundary, faces)])
-
-
-def faces_meeting(boundary: Boundary, functions: Bools) -> Bools:
-    """Return the faces in the union of the supports of the marked functions, shape (num_faces,)."""
-    level = boundary.level
-    if not functions.any():
-        return np.zeros(level.num_faces, dtype=bool)
-    vertices, traces = np.split(functions, [level.num_vertices])
-    return neighbourhood(level, level.touching(vertices)) | support_of_traces(boundary, traces)
+def _are_needed(along: Bools, keys: Sequence[Keys]) -> bool:
+    """Return whether marked faces of level 0 have children among those of the given keys."""
+    return bool(along.any()) and any(along[k >> 2].any() for k in keys)
 
 
 def _with_all_children(stage: Stage, children: Bools) -> Bools:
@@ -570,55 +638,6 @@ def _with_all_children(stage: Stage, children: Bools) -> Bools:
     first = stage.step.first_child[stage.refined]
     marks[stage.refined] = children[first[:, None] + np.arange(4)].all(axis=1)
     return marks
-
-
-def _cover(stage: Stage, wanted: Bools, kept: Bools, most: Bools) -> Bools:
-    """Return a small union of supports that holds the wanted faces and lies in the faces `most`, shape (num_faces,).
-
-    All supports that lie in the faces to be kept, wanted or not; then, for each face that is left, the one that adds
-    the fewest faces; then traces, for faces at the rim that only they can have brought.  (The smallest union of all
-    would be a set cover, which is NP-hard to find.)
-    """
-    if np.array_equal(kept, most):  # refinement alone
-        return most
-    boundary = stage.boundary
-    covered = faces_meeting(boundary, stage.selected & ~functions_meeting(boundary, ~kept))
-    left = wanted & ~covered
-    if not left.any():
-        return covered
-    candidates = stage.selected & ~functions_meeting(boundary, ~most)
-    vertices, traces = np.split(candidates, [stage.level.num_vertices])
-    chosen = np.zeros(boundary.num_functions, dtype=bool)
-    chosen[_cheapest(stage.level, np.flatnonzero(vertices), left, ~kept & ~covered)] = True
-    covered = covered | faces_meeting(boundary, chosen)
-    left = left & ~covered
-    chosen[stage.level.num_vertices :] = traces & traces_meeting(boundary, left)
-    return covered | faces_meeting(boundary, chosen)
-
-
-def _cheapest(level: Level, vertices: npt.NDArray[np.integer], left: Bools, unwanted: Bools) -> Ints:
-    """Return, for each face that is left, the best of the vertices whose function has it in its support.
-
-    The best has the fewest unwanted faces in its support; of these, the most that are left; of these, the first vertex.
-
-    Returns:
-        Vertices, ascending, each once; none for a face in no support.
-    """
-    corners = sp.csr_array(
-        (np.ones(level.vertices.size, dtype=np.int32), level.vertices, level.offsets),
-        shape=(level.num_faces, level.num_vertices),
-    )
-    around = sp.csr_array(corners @ corners.T)
-    own = sp.csc_array(corners)[:, vertices]
-    pairs = sp.coo_array(around @ own)  # face, function: the face is in the support
-    face, function = pairs.coords
-    cost = np.bincount(function[unwanted[face]], minlength=vertices.size)
-    gain = np.bincount(function[left[face]], minlength=vertices.size)
-    order = np.lexsort((-gain, cost))
-    rank = np.argsort(order)
-    best = np.full(level.num_faces, order.size)
-    np.minimum.at(best, face[left[face]], rank[function[left[face]]])
-    return np.unique(vertices[order[best[left & (best < order.size)]]]).astype(np.int32)
 
 
 def _with_sources(stages: Sequence[Stage], functions: Sequence[Bools]) -> list[Bools]:

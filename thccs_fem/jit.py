@@ -88,7 +88,8 @@ def compile_forms(forms: Sequence[ufl.Form]) -> tuple[list[Any], ModuleType]:
         OSError: There is no C compiler, or the cache can't be written.
         RuntimeError: The C compiler failed.
     """
-    return _compiled_by_ffcx(ffcx.codegeneration.jit.compile_forms, "forms", list(forms))
+    signature = ffcx.naming.compute_signature(list(forms), str(sorted(OPTIONS.items())))
+    return _compiled_by_ffcx(ffcx.codegeneration.jit.compile_forms, f"forms_{signature}", list(forms))
 
 
 def compile_expression(expression: ufl.core.expr.Expr, points: npt.NDArray[np.float64]) -> tuple[Any, ModuleType]:
@@ -106,17 +107,28 @@ def compile_expression(expression: ufl.core.expr.Expr, points: npt.NDArray[np.fl
         RuntimeError: The C compiler failed.
     """
     compiler = ffcx.codegeneration.jit.compile_expressions
-    (compiled,), module = _compiled_by_ffcx(compiler, "expression", [(expression, points)])
+    nowhere: npt.NDArray[np.floating[Any]] = points[:0]  # FFCx would print the points, with no more than 8 digits
+    signature = ffcx.naming.compute_signature([(expression, nowhere)], str(sorted(OPTIONS.items())))
+    key = hashlib.sha256(signature.encode() + repr(points.shape).encode() + points.tobytes()).hexdigest()
+    (compiled,), module = _compiled_by_ffcx(compiler, f"expression_{key}", [(expression, points)])
     return compiled, module
 
 
-def _compiled_by_ffcx(compiler: Callable[..., Any], kind: str, objects: list[Any]) -> tuple[list[Any], ModuleType]:
-    """Return what one of FFCx's compilers makes of the objects, from the cache if it is there."""
-    options: dict[str, Any] = {"options": OPTIONS, "cffi_extra_compile_args": list(FLAGS)}
-    name = f"{kind}_{ffcx.naming.compute_signature(objects, str(sorted(OPTIONS.items())))}"
-    directory = _built(name, lambda path: compiler(objects, cache_dir=path, **options))
-    compiled, module, _ = compiler(objects, cache_dir=directory, **options)
-    return compiled, module
+_loaded: dict[Path, tuple[list[Any], ModuleType]] = {}  # what this process has loaded, by directory
+
+
+def _compiled_by_ffcx(compiler: Callable[..., Any], name: str, objects: list[Any]) -> tuple[list[Any], ModuleType]:
+    """Return what one of FFCx's compilers makes of the objects, from memory or the cache if it is there.
+
+    Loading a module takes FFCx as long as finding its name: signatures of forms are half of what a small form costs.
+    """
+    directory = cache_directory() / name
+    if directory not in _loaded:
+        options: dict[str, Any] = {"options": OPTIONS, "cffi_extra_compile_args": list(FLAGS)}
+        _built(name, lambda path: compiler(objects, cache_dir=path, **options))
+        compiled, module, _ = compiler(objects, cache_dir=directory, **options)
+        _loaded[directory] = compiled, module
+    return _loaded[directory]
 
 
 @functools.cache

@@ -30,6 +30,7 @@ typedef struct {
   double *block;   /* (local, local): one pair of components of piece_tensor, A */
   double *half;    /* (local, width): A^T C */
   double *product; /* (width, width): C^T A C */
+  double *part_coefficients; /* piece_coefficients of a part of the piece, and behind them (local, components) values */
 } workspace;
 
 /* Return the allocation, to be freed, or NULL. */
@@ -41,9 +42,9 @@ static void *make_workspace(workspace *work, const thccs_batch *batch, const thc
   for (int32_t i = 0; i < integral->num_coefficients; ++i)
     block_sizes += integral->coefficients[i].block_size;
   const int64_t sizes[] = {w * block_sizes, local * block_sizes, local * local * components, w * w * components,
-                           local * local, local * w, w * w};
+                           local * local, local * w, w * w, local * (block_sizes + components)};
   int64_t total = 0;
-  for (int i = 0; i < 7; ++i)
+  for (int i = 0; i < 8; ++i)
     total += sizes[i];
   void *memory = calloc(total + 8, sizeof(double));
   if (!memory)
@@ -52,8 +53,8 @@ static void *make_workspace(workspace *work, const thccs_batch *batch, const thc
   memset(work->points, 0, sizeof work->points);
   double **parts[] = {&work->cell_coefficients, &work->piece_coefficients, &work->piece_tensor,
                       &work->cell_tensor,       &work->block,              &work->half,
-                      &work->product};
-  for (int i = 0; i < 7; ++i) {
+                      &work->product,           &work->part_coefficients};
+  for (int i = 0; i < 8; ++i) {
     *parts[i] = next;
     next += sizes[i];
   }
@@ -102,23 +103,34 @@ INLINE void extract_coefficients(int sides, const thccs_integral *integral, int3
   }
 }
 
-/* work->piece_tensor = the integral over a piece or facet. The coefficients of its cell have been gathered. */
-INLINE void integrate_piece(int sides, const thccs_batch *batch, const thccs_integral *integral, int64_t piece,
-                            int64_t size, workspace *work)
+/* work->points = those of a piece or facet. Return its coefficients; those of its cell have been gathered. */
+INLINE const double *load_piece(int sides, const thccs_batch *batch, const thccs_integral *integral, int64_t piece,
+                                workspace *work)
 {
   const int local = sides * LOCAL;
   const int32_t *nodes = batch->nodes + local * piece;
   for (int i = 0; i < local; ++i)
     for (int c = 0; c < batch->gdim; ++c)
       work->points[3 * i + c] = batch->points[(int64_t)batch->gdim * nodes[i] + c];
-  const double *coefficients = work->cell_coefficients;
-  if (batch->operators && integral->num_coefficients) {
-    extract_coefficients(sides, integral, batch->width, batch->operators + local * batch->width * piece, coefficients,
-                         work->piece_coefficients);
-    coefficients = work->piece_coefficients;
-  }
+  if (!batch->operators || !integral->num_coefficients)
+    return work->cell_coefficients;
+  extract_coefficients(sides, integral, batch->width, batch->operators + local * batch->width * piece,
+                       work->cell_coefficients, work->piece_coefficients);
+  return work->piece_coefficients;
+}
+
+/* work->piece_tensor = the integral over what work->points map. */
+INLINE void integrate(const thccs_integral *integral, const double *coefficients, int64_t size, workspace *work)
+{
   memset(work->piece_tensor, 0, size * sizeof(double));
   integral->kernel(work->piece_tensor, coefficients, integral->constants, work->points, FACETS, PERMUTATIONS, NULL);
+}
+
+/* work->piece_tensor = the integral over a piece or facet. */
+INLINE void integrate_piece(int sides, const thccs_batch *batch, const thccs_integral *integral, int64_t piece,
+                            int64_t size, workspace *work)
+{
+  integrate(integral, load_piece(sides, batch, integral, piece, work), size, work);
 }
 
 static int32_t chosen(const thccs_integral *integral, int32_t i)
@@ -329,20 +341,40 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
 
 /* ---- Local problems -------------------------------------------------------------------------------------------- */
 
-enum { BUBBLES = 4 }; /* of a cell: products of the cubic Bernstein polynomials 1 and 2, the first along x fastest */
+enum { BUBBLES = 4 }; /* of a cell: products of two polynomials along each side, the first along x fastest */
 
-/* Their local B-spline coefficients (16, 4) on a piece, which begins at origin in its cell and has edges u and v
-   there, the columns of axes: one of them along x, the other along y. */
-static void bubbles_on_piece(const double *origin, const double *axes, double *bubbles)
+/* Values at the knots r, s, t of the polar forms of 3 x (1 - x)^2 and 3 x^2 (1 - x). */
+static void continuous_bubbles(double r, double s, double t, double *values)
+{
+  const double sum = r + s + t, pairs = r * s + s * t + t * r, product = r * s * t;
+  values[0] = sum - 2.0 * pairs + 3.0 * product;
+  values[1] = pairs - 3.0 * product;
+}
+
+/* Of Hermite's cubics on [0, 1/2], 4 x^2 (3 - 4 x) with the value 1 at the end, and 4 x^2 (2 x - 1) with the slope 1;
+   on [1/2, 1] their mirror images, so that both are C1. */
+static void smooth_bubbles(int is_mirrored, double r, double s, double t, double *values)
+{
+  if (is_mirrored)
+    r = 1.0 - r, s = 1.0 - s, t = 1.0 - t;
+  const double pairs = r * s + s * t + t * r, product = r * s * t;
+  values[0] = 4.0 * pairs - 16.0 * product;
+  values[1] = (is_mirrored ? -1.0 : 1.0) * (8.0 * product - 4.0 / 3.0 * pairs);
+}
+
+/* Local B-spline coefficients (16, 4) of bubbles on a piece, which begins at origin in its cell and has edges u and v
+   there, the columns of axes: one of them along x, the other along y. For smooth ones it lies in a quarter of the cell. */
+static void bubbles_on_piece(int are_smooth, const double *origin, const double *axes, double *bubbles)
 {
   double factors[2][4][2]; /* along x and along y */
   for (int d = 0; d < 2; ++d)
     for (int i = 0; i < 4; ++i) {
       /* Coefficient i is the polar form at the knots i - 2, i - 1 and i of the piece. */
-      const double step = axes[2 * d] + axes[2 * d + 1], t = origin[d] + step * (i - 1), s = t - step, r = t + step;
-      const double sum = r + s + t, pairs = r * s + s * t + t * r, product = r * s * t;
-      factors[d][i][0] = sum - 2.0 * pairs + 3.0 * product; /* of 3 x (1 - x)^2 */
-      factors[d][i][1] = pairs - 3.0 * product;             /* of 3 x^2 (1 - x) */
+      const double step = axes[2 * d] + axes[2 * d + 1], t = origin[d] + step * (i - 1);
+      if (are_smooth)
+        smooth_bubbles(origin[d] + step / 2.0 > 0.5, t + step, t - step, t, factors[d][i]);
+      else
+        continuous_bubbles(t + step, t - step, t, factors[d][i]);
     }
   const int is_turned = fabs(axes[1]) > fabs(axes[0]);
   for (int j = 0; j < 4; ++j)
@@ -379,9 +411,42 @@ INLINE void add_on_bubbles(int32_t bs, const double *restrict b, const double *r
     }
 }
 
+/* B-spline coefficients (16, k) of a piece on one of its quarters, by knot insertion. */
+static void cut(int quarter, int32_t k, const double *restrict in, double *restrict out)
+{
+  static const double HALVES[2][4][4] = {
+      {{0.5, 0.5, 0.0, 0.0}, {0.125, 0.75, 0.125, 0.0}, {0.0, 0.5, 0.5, 0.0}, {0.0, 0.125, 0.75, 0.125}},
+      {{0.125, 0.75, 0.125, 0.0}, {0.0, 0.5, 0.5, 0.0}, {0.0, 0.125, 0.75, 0.125}, {0.0, 0.0, 0.5, 0.5}}};
+  for (int j = 0; j < 4; ++j)
+    for (int i = 0; i < 4; ++i)
+      for (int32_t c = 0; c < k; ++c) {
+        double sum = 0.0;
+        for (int b = 0; b < 4; ++b)
+          for (int a = 0; a < 4; ++a)
+            sum += HALVES[quarter / 2][j][b] * (HALVES[quarter % 2][i][a] * in[(a + 4 * b) * k + c]);
+        out[(i + 4 * j) * k + c] = sum;
+      }
+}
+
+/* Likewise all coefficients of an integral. Return the end of what was written. */
+static double *cut_coefficients(const thccs_integral *integral, int quarter, const double *in, double *out)
+{
+  for (int32_t i = 0; i < integral->num_coefficients; ++i) {
+    const int32_t bs = integral->coefficients[i].block_size;
+    const int32_t size = integral->coefficients[i].is_cellwise ? bs : LOCAL * bs;
+    if (integral->coefficients[i].is_cellwise)
+      memcpy(out, in, size * sizeof(double));
+    else if (integral->coefficients[i].values)
+      cut(quarter, bs, in, out);
+    in += size;
+    out += size;
+  }
+  return out;
+}
+
 int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
-                              const double *origins, const double *axes, const double *coefficients,
-                              double *matrices, double *residuals)
+                              int32_t are_smooth, const double *origins, const double *axes,
+                              const double *coefficients, double *matrices, double *residuals)
 {
   workspace work;
   const int32_t bs = block_size;
@@ -394,14 +459,37 @@ int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *in
     double *matrix = matrices + n * n * batch->cells[k], *residual = residuals + n * batch->cells[k];
     gather_coefficients(1, batch, integral, k, work.cell_coefficients);
     for (int64_t piece = batch->offsets[k]; piece < batch->offsets[k + 1]; ++piece) {
-      double b[LOCAL * BUBBLES];
+      const double *origin = origins + 2 * piece, *axis = axes + 4 * piece;
+      const double *own = load_piece(1, batch, integral, piece, &work);
       const double *c = coefficients ? coefficients + LOCAL * bs * piece : NULL;
-      bubbles_on_piece(origins + 2 * piece, axes + 4 * piece, b);
-      integrate_piece(1, batch, integral, piece, LOCAL * bs * columns, &work);
-      if (bs == 1)
-        add_on_bubbles(1, b, work.piece_tensor, c, matrix, residual);
-      else
-        add_on_bubbles(bs, b, work.piece_tensor, c, matrix, residual);
+      double b[LOCAL * BUBBLES], points[3 * LOCAL];
+      memcpy(points, work.points, sizeof points);
+      /* A piece that is a whole cell has smooth bubbles that are polynomials in each of its quarters alone. */
+      const int is_cut = are_smooth && fabs(axis[0]) + fabs(axis[1]) > 0.75;
+      for (int q = 0; q < (is_cut ? 4 : 1); ++q) {
+        const double *w = own, *u = c;
+        double from[2], along[4];
+        for (int d = 0; d < 2; ++d) {
+          from[d] = origin[d] + (is_cut ? (q % 2 * axis[2 * d] + q / 2 * axis[2 * d + 1]) / 2.0 : 0.0);
+          for (int e = 0; e < 2; ++e)
+            along[2 * d + e] = is_cut ? axis[2 * d + e] / 2.0 : axis[2 * d + e];
+        }
+        if (is_cut) {
+          cut(q, 3, points, work.points);
+          double *next = cut_coefficients(integral, q, own, work.part_coefficients);
+          w = work.part_coefficients;
+          if (c) {
+            cut(q, bs, c, next);
+            u = next;
+          }
+        }
+        bubbles_on_piece(are_smooth, from, along, b);
+        integrate(integral, w, LOCAL * bs * columns, &work);
+        if (bs == 1)
+          add_on_bubbles(1, b, work.piece_tensor, u, matrix, residual);
+        else
+          add_on_bubbles(bs, b, work.piece_tensor, u, matrix, residual);
+      }
     }
   }
   free(memory);

@@ -22,9 +22,10 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from thccs_fem.hierarchy import Hierarchy, Stage, faces_meeting, functions_meeting
+from thccs_fem.hierarchy import Hierarchy, Stage
 from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import by_first_rank, rank_of, size_of
+from thccs_fem.regions import faces_meeting, functions_meeting
 from thccs_fem.subdivision import Bools, Ints, neighbourhood
 
 __all__ = ["Partition", "cell_owners", "needed_functions", "partition"]

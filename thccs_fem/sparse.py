@@ -28,6 +28,8 @@ __all__ = [
     "rows_of",
     "stacked",
     "summed",
+    "transposed",
+    "without_rounding",
 ]
 
 Ints = npt.NDArray[np.int32]
@@ -92,6 +94,21 @@ def rows_of(a: sp.csr_array, rows: npt.NDArray[np.integer]) -> sp.csr_array:
     rows = rows.astype(np.int32, copy=False)
     _run("thccs_rows", rows.size, rows, *_arrays(a), indptr, indices, data)
     return csr(data, indices, indptr, (rows.size, a.shape[1]))
+
+
+def transposed(a: sp.csr_array) -> sp.csr_array:
+    """Return the transposed matrix."""
+    rows, columns, values = entries(a)
+    return summed([(columns, rows, values)], (a.shape[1], a.shape[0]))
+
+
+def without_rounding(a: sp.csr_array, tolerance: float) -> sp.csr_array:
+    """Return a matrix without the entries whose absolute value is less than the tolerance."""
+    indptr, indices, data = _arrays(a)
+    kept = np.abs(data) >= tolerance
+    count = np.zeros(kept.size + 1, dtype=np.int32)
+    np.cumsum(kept, out=count[1:])
+    return csr(data[kept], indices[kept], count[indptr], a.shape)
 
 
 def restricted(a: sp.csr_array, rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer]) -> sp.csr_array:

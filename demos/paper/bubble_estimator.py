@@ -153,8 +153,7 @@ def run(problem: Problem) -> tuple[np.ndarray, fem.Function]:
         rows.append((V.num_dofs, problem.energy_error(uh), estimate.norm(V, eta), estimate.norm(V, residuals)))
         return eta
 
-    history = adapt.solve(problem.V, problem.solve, indicators, steps=arguments.steps, theta=0.5)
-    assert history.solution is not None
+    history = adapt.solve(problem.V, problem.solve, indicators, stop=adapt.Stop(steps=arguments.steps))
     return np.array(rows), history.solution
 
 
@@ -175,10 +174,11 @@ for name, problem in problems.items():
 # the elements at the re-entrant corner. So the estimate is a lower bound of the error, and twice the estimate a fair
 # guess.
 #
-# The residual estimator is 3 to 6 times the error on the surfaces. On the L-domain that factor falls from 52 to 7, and
-# it means little: at the re-entrant corner the second derivatives of the functions are not square-integrable, so that
-# the factor depends on where the cap ends that replaces them. With `cap_level` 4, 8, 12, 16 and 20 it is 7.5, 15, 29,
-# 52 and 95 in the first step. That of the bubbles is 0.38 for all of these.
+# The residual estimator is 0.4 to 0.9 of the error on all three. That is owed to its weights. At the re-entrant corner
+# the second derivatives of the functions are not square-integrable: weighted by the size of the element as a whole, as
+# one would do elsewhere, the residual depends on where the cap ends that replaces them, and is 1.2, 2.4, 8.1 and 15
+# times the error in the first step with `cap_level` 4, 8, 16 and 20. `estimate.residual` takes the geometric mean of
+# the sizes of the element and of the piece of it, which is 0.4 for all of these, as are the bubbles.
 #
 # Other problems have other constants: 0.33 to 0.40 on a torus whose elements are twice as long as wide, 0.4 to 0.7
 # under uniform refinement around EVs with 3 to 8 edges. We also tried other bubbles. With four in each bicubic
@@ -195,10 +195,10 @@ for column, (name, table) in enumerate(tables.items()):
     above.loglog(dofs, error, "o-", color="black", markersize=3, label="energy error")
     above.loglog(dofs, bubbles, "^-", color="tab:blue", markersize=3, label="bubble estimate")
     above.set(title=name)
-    below.loglog(dofs, residual / error, "s-", color="tab:orange", markersize=3)
-    below.loglog(dofs, bubbles / error, "^-", color="tab:blue", markersize=3)
+    below.semilogx(dofs, residual / error, "s-", color="tab:orange", markersize=3)
+    below.semilogx(dofs, bubbles / error, "^-", color="tab:blue", markersize=3)
     below.axhline(1.0, color="black", linewidth=0.8)
-    below.set(ylim=(0.2, 100.0), xlabel="dofs", ylabel="effectivity")
+    below.set(ylim=(0.0, 1.2), xlabel="dofs", ylabel="effectivity")
     for axes in (above, below):
         axes.set_xlim(90, 4000)
         axes.xaxis.set_minor_formatter("")
@@ -224,8 +224,8 @@ plot.plot(
 #
 # ## Check
 #
-# The estimate is a lower bound, and its effectivity within 20 % of one value. The first two steps of the surfaces do
-# not count, where the bump is as wide as an element.
+# The estimate is a lower bound, and its effectivity within 20 % of one value; that of the residual changes by more, but
+# not much. The first two steps of the surfaces do not count, where the bump is as wide as an element.
 
 # %%
 for name, table in tables.items():
@@ -233,7 +233,5 @@ for name, table in tables.items():
     effectivity = bubbles / error
     assert 0.35 < effectivity.min() < effectivity.max() < 0.65, name
     assert effectivity.max() / effectivity.min() < 1.2 / 0.8, name
-    assert (residual > error).all(), name
+    assert 0.35 < (residual / error).min() < (residual / error).max() < 1.0, name
     assert error[-1] < error[0], name
-_, error, bubbles, residual = tables["L-domain"].T
-assert np.ptp(np.log(bubbles / error)) < np.ptp(np.log(residual / error))

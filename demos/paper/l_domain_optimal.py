@@ -24,7 +24,6 @@ import os
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import ufl
 from thccs_fem import adapt, estimate, fem, generators, plot
@@ -48,16 +47,12 @@ def exact(x):
     return (x[0] ** 2 + x[1] ** 2) ** (1 / 3) * ufl.sin(2 * theta / 3 - ufl.pi / 3)
 
 
-def solve(V: fem.FunctionSpace) -> fem.Function:
+def laplace(V: fem.FunctionSpace) -> LinearProblem:
     msh = V.mesh
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     bc = fem.dirichletbc(exact(ufl.SpatialCoordinate(msh)), fem.boundary_dofs(V), V)
-    problem = LinearProblem(
-        poisson.a(u, v), poisson.L(fem.Constant(msh, 0.0), v), bcs=[bc], petsc_options_prefix="l_domain_"
-    )
-    uh = problem.solve()
-    uh.name = "u"
-    return uh
+    a, L = poisson.a(u, v), poisson.L(fem.Constant(msh, 0.0), v)
+    return LinearProblem(a, L, bcs=[bc], u=fem.Function(V, "u"), petsc_options_prefix="l_domain_")
 
 
 # %% [markdown]
@@ -74,26 +69,21 @@ INDICATORS = {
 }
 
 
-def run(msh, driver: str, boundary: str = "clamped", dofs: int = arguments.dofs) -> tuple[np.ndarray, fem.Function]:
-    """Return dofs and errors in L2 and H1, shape (steps, 3), and the last solution."""
-    rows = []
+def errors(step: adapt.Step, uh: fem.Function) -> dict[str, float]:
+    V = uh.function_space
+    return {f"{norm} error": estimate.norm(V, estimate.error(uh, exact, norm)) for norm in ("L2", "H1")}
 
-    def solve_and_measure(V: fem.FunctionSpace) -> fem.Function:
-        uh = solve(V)
-        rows.append((V.num_dofs, *(estimate.norm(V, estimate.error(uh, exact, norm)) for norm in ("L2", "H1"))))
-        return uh
 
+def run(msh, driver: str, boundary: str = "clamped", dofs: int = arguments.dofs) -> adapt.History:
     V = fem.functionspace(msh, ("THCCS", 3), boundary=boundary, cap_level=16)
-    history = adapt.solve(
-        V, solve_and_measure, INDICATORS[driver], steps=arguments.steps, strategy="dorfler", theta=0.5, max_dofs=dofs
-    )
-    return np.array(rows), history.solution
+    stop = adapt.Stop(steps=arguments.steps, dofs=dofs)
+    return adapt.solve(V, laplace, INDICATORS[driver], stop=stop, callback=errors)
 
 
-def rates(table: np.ndarray) -> np.ndarray:
+def rates(history: adapt.History) -> list[float]:
     """Return the rates in L2 and H1 at which errors fall with dofs, but for the first steps, if there are more."""
-    dofs, *errors = np.log(table[4:] if len(table) > 8 else table).T
-    return -np.polyfit(dofs, np.transpose(errors), 1)[0]
+    steps = len(history.steps)
+    return [history.rate(f"{norm} error", last=steps - 4 if steps > 8 else steps) for norm in ("L2", "H1")]
 
 
 # %% [markdown]
@@ -104,10 +94,11 @@ meshes = {"L-domain1": generators.l_domain1(), "L-domain2": generators.l_domain2
 found = {(name, driver): run(msh, driver) for name, msh in meshes.items() for driver in INDICATORS}
 
 print("mesh       driven by  steps  dofs  L2 error  H1 error  rates L2   H1")
-for (name, driver), (table, _) in found.items():
-    dofs, l2, h1 = table[-1]
-    in_l2, in_h1 = rates(table)
-    print(f"{name:10} {driver:9} {len(table) - 1:6d} {dofs:5.0f} {l2:9.1e} {h1:9.1e} {in_l2:9.2f} {in_h1:4.2f}")
+for (name, driver), history in found.items():
+    l2, h1 = (history[f"{norm} error"][-1] for norm in ("L2", "H1"))
+    in_l2, in_h1 = rates(history)
+    last = history.steps[-1]
+    print(f"{name:10} {driver:9} {last.number:6d} {last.dofs:5d} {l2:9.1e} {h1:9.1e} {in_l2:9.2f} {in_h1:4.2f}")
 
 # %% [markdown]
 # Driven by the H1 error or by the residual, both norms fall at the optimal rate or faster on both meshes; faster,
@@ -121,8 +112,8 @@ for (name, driver), (table, _) in found.items():
 
 # %%
 TOLERANCE = 1e-6
-natural = {rule: run(generators.l_domain(4), "L2", rule, dofs=4000)[0] for rule in ("clamped", "crease")}
-needed = {rule: table[table[:, 1] <= TOLERANCE, 0] for rule, table in natural.items()}
+natural = {rule: run(generators.l_domain(4), "L2", rule, dofs=4000) for rule in ("clamped", "crease")}
+needed = {rule: history["dofs"][history["L2 error"] <= TOLERANCE] for rule, history in natural.items()}
 for rule, dofs in needed.items():
     print(f"{rule}: " + (f"{dofs.min():.0f} dofs for an L2 error of {TOLERANCE}" if dofs.size else "not so far"))
 
@@ -137,24 +128,13 @@ for rule, dofs in needed.items():
 # anything else, and of the extraordinary vertices those of valence 5 want most of the refinement.
 
 # %%
-figure = Figure(figsize=(9, 4.5), layout="constrained")
-columns = figure.subplots(1, 2, sharex=True)
-colors = {"L-domain1": "tab:blue", "L-domain2": "tab:orange"}
-styles = {"L2": "-", "H1": "--", "residual": ":"}
-for column, axes, norm, rate, start in zip((1, 2), columns, ("L2", "H1"), (2.0, 1.5), (4e-4, 2e-2), strict=True):
-    for (name, driver), (table, _) in found.items():
-        label = f"{name}, by {driver}"
-        axes.loglog(table[:, 0], table[:, column], styles[driver], color=colors[name], label=label)
-    for rule, table in natural.items():
-        color = "black" if rule == "clamped" else "grey"
-        axes.loglog(table[:, 0], table[:, column], color=color, label=f"4 x 4, {rule}, by L2")
-    span = np.array([400.0, 4000.0])
-    axes.loglog(span, start * (span / span[0]) ** -rate, color="tab:red", lw=1, label="rates 2 in L2, 1.5 in H1")
-    axes.set(xlabel="dofs", title=f"{norm} error")
-columns[0].legend(fontsize="small", loc="lower left")
-figure.savefig(arguments.out / "l_domain_optimal.png", dpi=150)
+runs = {f"{name}, by {driver}": history for (name, driver), history in found.items()}
+runs |= {f"4 x 4, {rule}, by L2": history for rule, history in natural.items()}
+for norm, rate in {"L2": 2.0, "H1": 1.5}.items():
+    file = arguments.out / f"l_domain_optimal_{norm.lower()}.png"
+    plot.convergence(runs, file, columns=f"{norm} error", slopes=[rate])
 
-uh = found["L-domain2", "residual"][1]
+uh = found["L-domain2", "residual"].solution
 eta = estimate.error(uh, exact, "H1")
 plot.plot(uh, arguments.out / "l_domain2_solution.png")
 plot.plot(uh, arguments.out / "l_domain2_h1_error.png", cell_data={"log10 of error": np.log10(eta)})
@@ -163,10 +143,10 @@ plot.plot(uh, arguments.out / "l_domain2_h1_error.png", cell_data={"log10 of err
 # ## Check
 
 # %%
-for (name, driver), (table, _) in found.items():
-    assert table[-1, 1] < table[0, 1] / 3, (name, driver)
-    if len(table) > 10:
-        in_l2, in_h1 = rates(table)
+for (name, driver), history in found.items():
+    assert history["L2 error"][-1] < history["L2 error"][0] / 3, (name, driver)
+    if len(history.steps) > 10:
+        in_l2, in_h1 = rates(history)
         assert in_l2 > 2.0, (name, driver, in_l2)
         assert in_h1 > (1.2 if driver == "L2" else 1.5), (name, driver, in_h1)
 if arguments.steps >= 30:

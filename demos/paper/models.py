@@ -208,24 +208,23 @@ for model in domains + models:
 
 # %%
 class Laplace:
-    """Laplace's equation on a model; keeps the solutions' energies and the first solution."""
+    """Laplace's equation on a model; keeps the first solution."""
 
     def __init__(self, msh: mesh.ControlMesh):
         tagged = [np.flatnonzero(msh.face_tags == tag) for tag in (1, 2)]
         self.patches = tagged if msh.face_tags.any() else mesh.end_faces(msh)
-        self.energies: list[float] = []
         self.first: fem.Function | None = None
 
-    def solve(self, V: fem.FunctionSpace) -> fem.Function:
+    def in_space(self, V: fem.FunctionSpace) -> LinearProblem:
         bcs = [fem.dirichletbc(u, fem.region_dofs(V, faces), V) for u, faces in enumerate(self.patches)]
-        uh = LinearProblem(*self.forms(V), bcs=bcs, petsc_options_prefix="models_").solve()
-        uh.name = "u"
-        self.energies.append(fem.assemble_scalar(fem.form(laplace_beltrami.a(uh, uh))))
-        self.first = self.first or uh
-        return uh
+        return LinearProblem(*self.forms(V), bcs=bcs, u=fem.Function(V, "u"), petsc_options_prefix="models_")
 
     def estimate(self, uh: fem.Function) -> np.ndarray:
         return estimate.bubble(uh, *self.forms(uh.function_space))
+
+    def energy(self, step: adapt.Step, uh: fem.Function) -> dict[str, float]:
+        self.first = self.first or uh
+        return {"energy": fem.assemble_scalar(fem.form(laplace_beltrami.a(uh, uh)))}
 
     def forms(self, V: fem.FunctionSpace) -> tuple[ufl.Form, ufl.Form]:
         u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -248,8 +247,8 @@ class Laplace:
 class Run:
     """What came of an adaptive run. Not its spaces: those with hundreds of EVs take 150 MB each."""
 
-    steps: list[adapt.Step]
-    energies: list[float]
+    steps: tuple[adapt.Step, ...]
+    energies: np.ndarray
     values: tuple[float, float]  # least and largest coefficient of the last solution
 
     @property
@@ -264,16 +263,15 @@ class Run:
 def run(V: fem.FunctionSpace, tolerance: float = 0.0, picture: str | None = None) -> Run:
     """Run on a model; draw the first and the last solution if there is a name for pictures."""
     problem = Laplace(V.mesh)
-    steps = arguments.steps
-    history = adapt.solve(V, problem.solve, problem.estimate, steps=steps, theta=THETA, tolerance=tolerance)
+    rule, stop = adapt.Marking(theta=THETA), adapt.Stop(tolerance=tolerance, steps=arguments.steps)
+    history = adapt.solve(V, problem.in_space, problem.estimate, marking=rule, stop=stop, callback=problem.energy)
     assert problem.first is not None
-    assert history.solution is not None
     if picture is not None:
         for when, u in (("before", problem.first), ("after", history.solution)):
             path = arguments.out / f"models_{picture.lower()}_{when}.png"
             plot.plot(u, filename=path, camera=by_name[picture].camera, clim=(0.0, 1.0), window_size=WINDOW)
     values = history.solution.x.array
-    return Run(history.steps, problem.energies, (values.min(), values.max()))
+    return Run(history.steps, history["energy"], (values.min(), values.max()))
 
 
 direct: dict[str, Run] = {}

@@ -72,7 +72,7 @@ def test_one_function_a_step(name: str) -> None:
         return estimate.error(uh, exact, "L2")
 
     V = space(MESHES[name], boundary="crease")
-    history = adapt.solve(V, solve, l2, steps=STEPS, strategy="worst", progress=False)
+    history = adapt.solve(V, solve, l2, marking=adapt.Marking("worst"), stop=adapt.Stop(steps=STEPS), progress=False)
     last = history.steps[-1]
     dofs, error = WORST[name]
     assert (last.number, last.levels) == (STEPS, LEVELS)

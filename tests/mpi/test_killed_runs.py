@@ -37,7 +37,7 @@ def run(comm, path, kill_in=None, seconds=0.0):
         return estimate.residual(u, poisson.strong_residual(u, f))
 
     V = fem.functionspace(msh, ("THCCS", 3))
-    history = adapt.solve(V, solver, estimator, steps=4, checkpoint=path, progress=False)
+    history = adapt.solve(V, solver, estimator, stop=adapt.Stop(steps=4), checkpoint=path, progress=False)
     u = history.solution
     return done, [(s.dofs, s.elements) for s in history.steps], [s.estimate for s in history.steps], (
         u.x.index_map.gather(u.x.array)

@@ -1,4 +1,4 @@
-"""Indicators, marks, refinement and the loop of them on several ranks: what a serial run comes to, cell by cell."""
+"""Indicators, marks and refinement on several ranks: what a serial run comes to, cell by cell."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from compared import same_as_in_serial, shared
-from problems import singular, smooth, wavy
+from problems import smooth, wavy
 from zoo import ZOO
 
 import ufl
@@ -175,47 +175,3 @@ def test_what_one_rank_gets_wrong_is_refused_by_all(comm: MPI.Comm) -> None:
 
 
 # ---- Runs
-
-
-def on_the_l_domain(V: fem.FunctionSpace) -> fem.Function:
-    """Solve Laplace's equation with r^(2/3) on the boundary."""
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    exact = singular(ufl.SpatialCoordinate(V.mesh))
-    bc = fem.dirichletbc(exact, fem.boundary_dofs(V), V)
-    a, L = inner(grad(u), grad(v)) * dx, fem.Constant(V.mesh, 0.0) * v * dx
-    return LinearProblem(a, L, bcs=[bc], petsc_options=MUMPS, petsc_options_prefix="laplace_").solve()
-
-
-def test_an_adaptive_run_marks_and_refines_the_same() -> None:
-    """Residuals of a solution with a singularity, to nine levels: marks, hierarchies, estimates and the solution."""
-
-    def run(comm: MPI.Comm) -> dict[str, Any]:
-        V = fem.functionspace(generators.l_domain(2, comm=comm), ("THCCS", 3))
-        found: dict[str, Any] = {}
-
-        def estimator(uh: fem.Function) -> Floats:
-            space = uh.function_space
-            eta = estimate.residual(uh, div(grad(uh)))
-            found[f"marks {len(found)}"] = adapt.mark(space, eta)
-            return eta
-
-        history = adapt.solve(V, on_the_l_domain, estimator, steps=14, progress=False)
-        assert history.solution is not None
-        uh, space = history.solution, history.solution.function_space
-        assert space.num_levels >= 9
-        assert [step.imbalance for step in history.steps][-1] == partition(space.hierarchy).imbalance < 1.1
-        assert history.steps == comm.bcast(history.steps)  # seconds, too
-        assert ("imbalance" in str(history)) == (comm.size > 1)
-        steps = [(s.number, s.levels, s.elements, s.dofs, s.estimate) for s in history.steps]
-        return found | keys(space.hierarchy) | {"steps": steps, "solution": uh.x.index_map.gather(uh.x.array)}
-
-    same_as_in_serial(run)
-
-
-def test_progress_is_shown_by_the_first_rank(comm: MPI.Comm, capfd: pytest.CaptureFixture[str]) -> None:
-    V = fem.functionspace(generators.torus((6, 6), comm=comm), ("THCCS", 3))
-    adapt.solve(
-        V, lambda V: fem.Function(V), lambda u: np.ones(u.function_space.cells.num_owned), steps=1, progress=True
-    )
-    err = capfd.readouterr().err
-    assert ("adaptive run" in err) == (comm.rank == 0)

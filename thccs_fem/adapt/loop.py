@@ -4,76 +4,58 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from thccs_fem import checkpoint, estimate
-from thccs_fem.adapt.marking import Strategy, mark
+from thccs_fem import estimate
+from thccs_fem.adapt.history import COLUMNS, History, Step
+from thccs_fem.adapt.marking import Marking
 from thccs_fem.adapt.remeshing import refine
+from thccs_fem.adapt.resuming import Solution, begun, listed, resumed, save
+from thccs_fem.adapt.transfer import transfer
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.space import FunctionSpace, cellwise
-from thccs_fem.parallel import by_first_rank, largest, rank_of
+from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.parallel import by_first_rank, largest, rank_of, together
 from thccs_fem.partition import partition
 
-__all__ = ["History", "Step", "solve"]
+__all__ = ["Problem", "solve"]
 
 Floats = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Step:
-    """What one step of an adaptive run came to.
+class Problem(Protocol):
+    """What is to be solved in a space: a LinearProblem or NonlinearProblem of `fem.petsc` or `fem.scipy`, or your own.
 
-    Seconds are of wall time, on the slowest rank. The imbalance is the weight of the cells of the rank that has most,
-    relative to the mean.
+    A method ``start_from_u()`` may be there as well: it lets `solve` start from the values of `u`, and returns whether
+    it will; if it won't, nobody has to provide them.
     """
 
-    number: int
-    levels: int
-    elements: int
-    dofs: int
-    estimate: float
-    seconds: float
-    imbalance: float = 1.0
+    @property
+    def u(self) -> Any:
+        """The solution, a `Function` or a list of them, which has the initial guess before."""
 
-
-@dataclass
-class History:
-    """Steps of an adaptive run and the last solution; `print(history)` shows a table."""
-
-    steps: list[Step] = field(default_factory=list)
-    solution: Function | None = None
-
-    def __str__(self) -> str:
-        head = f"{'step':>4} {'levels':>6} {'elements':>9} {'dofs':>9} {'estimate':>10} {'seconds':>8}"
-        rows = [
-            f"{s.number:4d} {s.levels:6d} {s.elements:9d} {s.dofs:9d} {s.estimate:10.3e} {s.seconds:8.2f}"
-            for s in self.steps
-        ]
-        if any(s.imbalance != 1.0 for s in self.steps):  # on several ranks
-            head += f" {'imbalance':>9}"
-            rows = [f"{row} {s.imbalance:9.3f}" for row, s in zip(rows, self.steps, strict=True)]
-        return "\n".join([head, *rows])
+    def solve(self) -> Any:
+        """Give `u` the values that solve the problem."""
 
 
 def solve(
     V: FunctionSpace,
-    solver: Callable[[FunctionSpace], Function],
-    estimator: Callable[[Function], Floats],
+    problem: Callable[[FunctionSpace], Problem | Solution],
+    estimator: Callable[[Any], npt.ArrayLike | tuple[npt.ArrayLike, float]],
     *,
-    steps: int,
-    strategy: Strategy = "dorfler",
-    theta: float = 0.5,
-    tolerance: float = 0.0,
-    max_dofs: int | None = None,
+    marking: Callable[[FunctionSpace, Floats], npt.ArrayLike] = Marking(),  # noqa: B008  # frozen
+    stop: Callable[[History], str | None],
+    callback: Callable[[Step, Any], Mapping[str, float] | None] | None = None,
     progress: bool | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
 ) -> History:
     """Solve, estimate, mark and refine, again and again; collective.
+
+    Each solution is the initial guess for the next one: exactly the same function, on the refined space.
 
     With a checkpoint each step is written to a file when it is done; if the file is there at the beginning, the run
     goes on after the last step in it, and comes to the same as one without an interruption. Arguments may have changed,
@@ -82,13 +64,14 @@ def solve(
 
     Args:
         V: The space to begin with.
-        solver: Takes a space, returns the solution in it.
-        estimator: Takes a solution, returns the indicator of each cell that this rank owns, shape (cells.num_owned,).
-        steps: Number of refinements; the problem is solved once more than that.
-        strategy: See `mark`.
-        theta: See `mark`.
-        tolerance: Stop when the estimate (the norm of all indicators) is at most this.
-        max_dofs: Stop when the space has at least so many dofs.
+        problem: Takes a space and returns a `Problem` in it, whose `u` gets the initial guess; or returns the solution
+            itself, a function or a list of those of several unknowns.
+        estimator: Takes a solution, returns the indicator of each cell that this rank owns, shape (cells.num_owned,);
+            or these and the estimate of the error, where that is not their norm. It may have a sign, as that of a goal.
+        marking: Takes the space and the indicators, returns the functions to refine, as `mark` does.
+        stop: When to end, a `Stop`; or takes the history after each step, and returns why the run ends, or None.
+        callback: Called after each step with the `Step` and the solution. It may return numbers by name, as
+            ``{"error": 1e-4}``, which become columns of the history; those of rank 0 count.
         progress: Show a progress bar (rank 0 does); None: only in a terminal.
         checkpoint: The file to write to, and to go on from. `checkpoint.read` finds the solution in it, too.
 
@@ -96,68 +79,111 @@ def solve(
         The history with the last solution.
 
     Raises:
-        ValueError: If the checkpoint is of another loop, space or mesh, or none that `checkpoint.read` can read.
+        TypeError: If the problem is neither a problem nor a solution, or the callback returns no numbers by name.
+        ValueError: If the checkpoint is of another loop, space or mesh, or none that `checkpoint.read` can read; or the
+            solution is in another space than the problem was made for; or a name from the callback is taken.
     """
     from tqdm import tqdm
 
-    if steps < 0:
-        raise ValueError(f"steps is {steps}; it must not be negative")
-    history, V, eta = (History(), V, np.zeros(0)) if checkpoint is None else _resumed(checkpoint, V)
-
-    def is_over() -> bool:
-        last = history.steps[-1]
-        return last.number >= steps or last.estimate <= tolerance or (max_dofs is not None and last.dofs >= max_dofs)
-
+    run = begun(V) if checkpoint is None else resumed(checkpoint, V)
+    V, reason = run.V, stop(run.history) if run.history.steps else None
+    most = getattr(stop, "steps", None)
     with tqdm(
-        total=steps + 1,
-        initial=len(history.steps),
+        total=None if most is None else most + 1,
+        initial=len(run.history.steps),
         desc="adaptive run",
         unit="step",
         disable=rank_of(V.mesh.comm) > 0 or (None if progress is None else not progress),
     ) as bar:
-        while not history.steps or not is_over():
+        while reason is None:
             start = time.perf_counter()
-            if history.steps:
-                V = refine(V, mark(V, eta, strategy=strategy, theta=theta))
-            u = solver(V)
-            eta = estimator(u)
-            total = estimate.norm(V, eta)
-            seconds = largest(V.mesh.comm, time.perf_counter() - start)
-            size = V.num_levels, V.num_cells, V.num_dofs
-            imbalance = partition(V.hierarchy).imbalance
-            history.steps.append(Step(len(history.steps), *size, total, seconds, imbalance))
-            history.solution = u
+            if run.history.steps:
+                V = refine(run.V, marking(run.V, run.eta))
+                if V.num_cells == run.V.num_cells:
+                    reason = "no function is marked, or none that can be refined"
+                    break
+            u = _solution(V, problem(V), run.history.solution)
+            eta, total = _estimated(V, estimator(u))
+            step = _step(V, u, len(run.history.steps), total, largest(V.mesh.comm, time.perf_counter() - start))
+            if callback is not None:
+                step = replace(step, values=_numbers(V, callback(step, u)))
+            run = replace(run, V=V, history=History((*run.history.steps, step), u), eta=eta)
             if checkpoint is not None:
-                _save(checkpoint, history, V, eta)
-            bar.set_postfix(dofs=V.num_dofs, estimate=f"{total:.2e}")
+                save(checkpoint, run)
+            reason = stop(run.history)
+            bar.set_postfix(dofs=step.dofs, estimate=f"{abs(total):.2e}")
             bar.update()
-    return history
+    return replace(run.history, reason=reason)
 
 
-def _save(path: str | os.PathLike[str], history: History, V: FunctionSpace, eta: Floats) -> None:
-    """Write what `solve` needs to go on."""
-    assert history.solution is not None  # after a step
-    indicators = Function(cellwise(V), name=f"indicators of {history.solution.name}")
-    indicators.x.array[: eta.size] = eta
-    run = {"steps": [asdict(step) for step in history.steps], "solution": history.solution.name}
-    checkpoint.write(path, [history.solution, indicators], {"adapt.solve": run})
+def _step(V: FunctionSpace, u: Solution, number: int, total: float, seconds: float) -> Step:
+    dofs = sum(function.function_space.num_dofs for function in listed(u))
+    return Step(number, V.num_levels, V.num_cells, dofs, total, seconds, partition(V.hierarchy).imbalance)
 
 
-def _resumed(path: str | os.PathLike[str], V: FunctionSpace) -> tuple[History, FunctionSpace, Floats]:
-    """Return what `_save` has written; if it has written nothing, a new history, and V."""
-    if not by_first_rank(V.mesh.comm, Path(path).exists):
-        return History(), V, np.zeros(0)
-    saved = checkpoint.read(path, mesh=V.mesh)
-    if "adapt.solve" not in saved.attributes:
-        raise ValueError(f"{path} was not written by adapt.solve: give another name, or remove it to begin anew")
-    run = saved.attributes["adapt.solve"]
-    steps = [Step(**step) for step in run["steps"]]
-    indicators = saved.functions[f"indicators of {run['solution']}"]
-    found = indicators.function_space.hierarchy
-    if steps[0].dofs != V.num_dofs or not found.is_refinement_of(V.hierarchy):
+# ---- What the user's functions return --------------------------------------------------------------------------------
+
+
+def _is_solution(given: object) -> bool:
+    several = isinstance(given, list | tuple) and len(given) > 0 and all(isinstance(u, Function) for u in given)
+    return several or isinstance(given, Function)
+
+
+def _solution(V: FunctionSpace, posed: Any, last: Any) -> Any:
+    """Return the solution of what was posed in a space, from the last one if it looks at it."""
+    if not _is_solution(posed):
+        if not (hasattr(posed, "solve") and _is_solution(getattr(posed, "u", None))):
+            raise TypeError(
+                f"the problem in {V} is of type {type(posed).__name__}: give something that has a method solve() and "
+                f"the function u that it solves for, as a LinearProblem does; or return the solution, a fem.Function "
+                f"or a list of them"
+            )
+        if last is not None and (not hasattr(posed, "start_from_u") or posed.start_from_u()):
+            _guess(posed.u, last)
+        posed.solve()
+        posed = posed.u
+    found = listed(posed)[0].function_space
+    if found.hierarchy is not V.hierarchy and not found.hierarchy.same_as(V.hierarchy):
         raise ValueError(
-            f"{path} is of a run that began with {steps[0].dofs} dofs in another space than {V}: begin with the same, "
-            f"or give another name, or remove the file to begin anew"
+            f"the problem was called with {V}, but its solution is in {found}: make its forms, conditions and "
+            f"functions anew in the space that it is called with"
         )
-    eta = indicators.x.array[: indicators.x.index_map.size_local]
-    return History(steps, saved.functions[run["solution"]]), V.with_hierarchy(found), eta
+    return posed
+
+
+def _guess(u: Solution, last: Solution) -> None:
+    """Give the unknowns the values of the last solution."""
+    for function, before in zip(listed(u), listed(last), strict=True):
+        function.x.array = transfer(before, function.function_space).x.array
+
+
+def _estimated(V: FunctionSpace, returned: Any) -> tuple[Floats, float]:
+    """Return the indicators and the estimate."""
+    given, value = returned if isinstance(returned, tuple) else (returned, None)
+    num_cells = partition(V.hierarchy).cells.size_local
+
+    def checked() -> Floats:
+        eta = np.asarray(given, dtype=np.float64)
+        if eta.shape != (num_cells,):
+            raise ValueError(
+                f"the estimator returned indicators of shape {eta.shape}; it needs one for each of the {num_cells} "
+                f"cells, ({num_cells},), or these and the estimate, (eta, estimate)"
+            )
+        return eta
+
+    eta = together(V.mesh.comm, checked)
+    return eta, estimate.norm(V, eta) if value is None else float(value)
+
+
+def _numbers(V: FunctionSpace, returned: Any) -> Mapping[str, float]:
+    """Return the numbers of a callback, those of rank 0 on all ranks."""
+
+    def checked() -> dict[str, float]:
+        if not isinstance(returned, Mapping | None):
+            raise TypeError(f"the callback returned a {type(returned).__name__}: return None, or numbers by name")
+        taken = [name for name in returned or () if name in COLUMNS or name == "rate"]
+        if taken:
+            raise ValueError(f"the callback names a number {taken[0]!r}, as a column that is there: take another name")
+        return {name: float(value) for name, value in (returned or {}).items()}
+
+    return by_first_rank(V.mesh.comm, checked)

@@ -2,10 +2,13 @@
 
 What is refined is always the support of functions: refining elements that hold no whole support would change nothing
 (sec. 4 of the paper).  A function's indicator is the root of the sum of eta^2 over the cells of its support (eq. 32).
+In a space refined by rings it is the ring, the faces at the function's vertex, in the place of the support: every
+cell lies in the ring of some function, so that marks can carry all of the error.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -14,15 +17,40 @@ import scipy.sparse as sp
 
 from thccs_fem.extraction import Cells
 from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.hierarchy import Hierarchy, Stage
+from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import together
 from thccs_fem.partition import Partition, partition
 
-__all__ = ["Strategy", "mark", "mark_coarsening"]
+__all__ = ["TIE", "Marking", "Strategy", "mark", "mark_coarsening", "on_all_cells", "places", "uniform"]
 
 Floats = npt.NDArray[np.float64]
 Strategy = Literal["worst", "maximum", "dorfler"]
 
 TIE = 1e-6  # relative difference up to which indicators count as equal: they are small differences of solutions
+
+
+@dataclass(frozen=True)
+class Marking:
+    """How a loop marks functions: calling it with a space and indicators is `mark` with these arguments.
+
+    Attributes:
+        strategy: See `mark`.
+        theta: See `mark`.
+
+    Raises:
+        ValueError: If the strategy is unknown or theta out of range.
+    """
+
+    strategy: Strategy = "dorfler"
+    theta: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check_rule(self.strategy, self.theta)
+
+    def __call__(self, V: FunctionSpace, eta: Floats) -> npt.NDArray[np.int64]:
+        """Return function numbers, as `mark` does; collective."""
+        return mark(V, eta, self.strategy, self.theta)
 
 
 def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: float = 0.5) -> npt.NDArray[np.int64]:
@@ -36,7 +64,7 @@ def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: f
         eta: Indicator of each cell that this rank owns, not squared, shape (cells.num_owned,).
         strategy: "worst": the one function with the largest indicator (the paper's rule). "maximum": all whose
             indicator is at least theta times the largest. "dorfler": the fewest functions, the largest indicators
-            first, whose supports together carry theta of the sum of squares.
+            first, whose supports (rings, in a space that is refined by them) carry theta of the sum of squares.
         theta: Parameter of "maximum" and "dorfler", in (0, 1].
 
     Returns:
@@ -45,20 +73,30 @@ def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: f
     Raises:
         ValueError: If eta does not fit the cells or is negative or not finite, or strategy or theta is unknown.
     """
-    squares = _gathered(V, eta) ** 2
-    if strategy not in ("worst", "maximum", "dorfler"):
-        raise ValueError(f'strategy is {strategy!r}; it must be "worst", "maximum" or "dorfler"')
-    if not 0.0 < theta <= 1.0:
-        raise ValueError(f"theta is {theta}; it must lie in (0, 1]")
-    parts, supports = V.cells.partition, _supports(V.cells)
-    indicator = np.sqrt(parts.functions.gather(supports @ squares[parts.cells.numbers]))
+    squares = on_all_cells(V, eta) ** 2
+    _check_rule(strategy, theta)
+    if V.hierarchy.unit == "ring":
+        parts, units = _everywhere(V.hierarchy), _rings(V.hierarchy)
+    else:
+        parts, units = V.cells.partition, _supports(V.cells)
+    indicator = np.sqrt(parts.functions.gather(units @ squares[parts.cells.numbers]))
     if not indicator.any():
         return np.zeros(0, dtype=np.int64)
     if strategy == "worst":
-        return np.array([np.argmax(_places(indicator))])
+        return np.array([np.argmax(places(indicator))])
     if strategy == "maximum":
         return np.flatnonzero(indicator >= theta * indicator.max() * (1.0 - TIE))
-    return _dorfler(parts, supports, indicator, squares, theta)
+    return _dorfler(parts, units, indicator, squares, theta)
+
+
+def uniform(V: FunctionSpace, eta: Floats) -> npt.NDArray[np.int64]:
+    """Return all functions, whatever their indicators: uniform refinement, to compare adaptive runs with.
+
+    Args:
+        V: The space.
+        eta: Not looked at.
+    """
+    return np.arange(V.num_functions)
 
 
 def mark_coarsening(V: FunctionSpace, eta: Floats, theta: float = 0.05) -> npt.NDArray[np.int64]:
@@ -79,10 +117,10 @@ def mark_coarsening(V: FunctionSpace, eta: Floats, theta: float = 0.05) -> npt.N
     Raises:
         ValueError: If eta does not fit the cells or is negative or not finite, or theta is out of range.
     """
-    squares = _gathered(V, eta) ** 2
+    squares = on_all_cells(V, eta) ** 2
     if not 0.0 <= theta < 1.0:
         raise ValueError(f"theta is {theta}; it must lie in [0, 1)")
-    order = np.argsort(_places(squares), kind="stable")
+    order = np.argsort(places(squares), kind="stable")
     carried = np.cumsum(squares[order])
     marks = np.zeros(order.size, dtype=bool)
     marks[order] = carried <= theta * carried[-1] * (1.0 + TIE)
@@ -90,7 +128,14 @@ def mark_coarsening(V: FunctionSpace, eta: Floats, theta: float = 0.05) -> npt.N
     return np.flatnonzero(marks[cells.numbers[: cells.size_local]])
 
 
-def _gathered(V: FunctionSpace, eta: npt.ArrayLike) -> Floats:
+def _check_rule(strategy: Strategy, theta: float) -> None:
+    if strategy not in ("worst", "maximum", "dorfler"):
+        raise ValueError(f'strategy is {strategy!r}; it must be "worst", "maximum" or "dorfler"')
+    if not 0.0 < theta <= 1.0:
+        raise ValueError(f"theta is {theta}; it must lie in (0, 1]")
+
+
+def on_all_cells(V: FunctionSpace, eta: npt.ArrayLike) -> Floats:
     """Return the indicators of all cells, by their numbers in the hierarchy."""
     cells = partition(V.hierarchy).cells
     return cells.gather(together(V.mesh.comm, lambda: _checked(cells.size_local, eta)))
@@ -117,7 +162,49 @@ def _supports(cells: Cells) -> sp.csr_array:
     return sp.csr_array((ones, (row[used], column[used])), shape=(cells.num_dofs, cells.num_cells))
 
 
-def _places(values: Floats) -> npt.NDArray[np.int64]:
+def _everywhere(hierarchy: Hierarchy) -> Partition:
+    """Return the numbers of a rank that works on all cells and functions, as each does where that is little."""
+    cells = sum(stage.active_faces.size for stage in hierarchy.stages[: hierarchy.num_levels])
+    return Partition(IndexMap.whole(cells), IndexMap.whole(hierarchy.num_dofs), 1.0)
+
+
+def _rings(hierarchy: Hierarchy) -> sp.csr_array:
+    """Return the incidence of functions and the cells in their rings, shape (num_dofs, number of cells), entries 1."""
+    stages = hierarchy.stages[: hierarchy.num_levels]
+    keys = np.concatenate([stage.level.keys[stage.active_faces] for stage in stages])
+    levels = np.repeat(np.arange(len(stages)), [stage.active_faces.size for stage in stages])
+    rows, columns = [], []
+    for l, stage in enumerate(stages):
+        cells = np.flatnonzero(levels >= l)
+        faces = np.searchsorted(stage.level.keys, keys[cells] >> 2 * (levels[cells] - l))  # that cells are, or lie in
+        dofs = _dofs_at_vertices(stage, int(hierarchy.dof_offsets[l]))[stage.level.quads[faces]].reshape(cells.size, -1)
+        cell, place = np.nonzero(dofs >= 0)
+        rows.append(dofs[cell, place])
+        columns.append(cells[cell])
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    return sp.csr_array((np.ones(row.size), (row, column)), shape=(hierarchy.num_dofs, keys.size))
+
+
+def _dofs_at_vertices(stage: Stage, first: int) -> npt.NDArray[np.int64]:
+    """Return the dofs of a level at each vertex, its own and up to three traces, -1 for none, (num_vertices, 1 or 4).
+
+    Args:
+        stage: The level.
+        first: Its first dof.
+    """
+    boundary = stage.boundary
+    numbers = np.full(boundary.num_functions, -1)
+    numbers[stage.active] = first + np.arange(np.count_nonzero(stage.active))
+    own, traces = np.split(numbers, [stage.level.num_vertices])
+    if not traces.size:
+        return own[:, None]
+    dofs = np.full((own.size, 4), -1)
+    dofs[:, 0] = own
+    dofs[boundary.vertex, np.arange(traces.size) - (boundary.first[boundary.vertex] - own.size) + 1] = traces
+    return dofs
+
+
+def places(values: Floats) -> npt.NDArray[np.int64]:
     """Return the place of each value among all different ones, ascending, shape (n,); ties share one."""
     order = np.argsort(values)
     rising = values[order]
@@ -127,13 +214,13 @@ def _places(values: Floats) -> npt.NDArray[np.int64]:
 
 
 def _dorfler(
-    parts: Partition, supports: sp.csr_array, indicator: Floats, squares: Floats, theta: float
+    parts: Partition, units: sp.csr_array, indicator: Floats, squares: Floats, theta: float
 ) -> npt.NDArray[np.int64]:
-    """Take functions by falling indicator until their supports carry theta; leave out those that add no cell."""
-    order = np.argsort(-_places(indicator), kind="stable")
+    """Take functions by falling indicator until their units carry theta; leave out those that add no cell."""
+    order = np.argsort(-places(indicator), kind="stable")
     turn = np.zeros(order.size, dtype=np.int64)
     turn[order] = np.arange(order.size)
-    by_cell = sp.csc_array(supports)
+    by_cell = sp.csc_array(units)
     turns = turn[parts.functions.numbers[by_cell.indices]]
     first = parts.cells.gather(np.minimum.reduceat(turns, by_cell.indptr[:-1]))
     carried = np.cumsum(np.bincount(first, weights=squares, minlength=order.size))

@@ -17,38 +17,61 @@ __all__ = ["bubble"]
 Floats = npt.NDArray[np.float64]
 
 
-def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form) -> Floats:
+def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form | None = None) -> Floats:
     """Return the bubble indicators: the energy norms of the error's projections onto four bubble functions a cell.
 
     In each cell, for all components together, the local problem for a combination z of bubbles is
 
         a(z, b) = L(b) - a(uh, b)    for all bubbles b of the cell,        eta^2 = |a(z, z)|,
 
-    the problem that uh solves, as it was written, with its quadrature. Bubbles are the bicubic Bernstein polynomials of
-    the cell that vanish on its edges: they are continuous, but not in the space, which is smoother. An irregular cell
-    has four as well, over all its pieces.
+    the problem that uh solves, as it was written, with its quadrature. Of a nonlinear one give the form F that vanishes
+    for the solution, ``bubble(uh, F)`` with F in uh itself and a test function: then a is the derivative of F at uh,
+    and -F(uh; b) the right-hand side.
+
+    Bubbles are polynomials, bicubic in the cell, that vanish on its edges: they are continuous, but not in the space,
+    which is smoother. An irregular cell has four as well, over all its pieces. For a fourth-order equation, whose forms
+    have second derivatives of the test function, they are bicubic in each quarter of the cell, and C1: value and
+    normal derivative vanish on the edges.
 
     If a is symmetric and positive definite, eta is at most the energy norm of the error in the cell, up to quadrature;
-    what it misses is the part of the error that lives on the edges. It is an indicator for second-order equations
-    in a coercive form: of a pure advection a(z, z) is zero.
+    what it misses is the part of the error that lives on the edges. At fourth order that can be all of it, where forces
+    on the edges are in balance with themselves (docs/fourth_order.md). It is an indicator for equations in a coercive
+    form: of a pure advection a(z, z) is zero.
 
     Args:
         uh: The approximation; the indicators belong to its cells.
-        a: Bilinear form in trial and test functions of the space of uh.
+        a: Bilinear form in trial and test functions of the space of uh; or F, if L is left out.
         L: Linear form in a test function of that space. Bubbles do not see integrals over edges.
 
     Returns:
         Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
-        ValueError: If forms and uh have different spaces, functions on finer cells, or second derivatives of the test
-            function; or the local problem of a cell has no solution.
+        ValueError: If forms and uh have different spaces or functions on finer cells; F does not depend on uh; or the
+            local problem of a cell has no solution.
     """
-    V, a, L = uh.function_space, form(a), form(L)
-    _check_problem(V, a, L)
-    squares = np.abs(bubble_energies(a, L, uh))
+    V = uh.function_space
+    bilinear, linear = _linearised(uh, a) if L is None else (form(a), form(L))
+    _check_problem(V, bilinear, linear)
+    squares = np.abs(bubble_energies(bilinear, linear, None if L is None else uh))
     _check_solved(V, np.flatnonzero(np.isinf(squares)))
     return np.sqrt(squares)
+
+
+def _linearised(uh: Function, F: ufl.Form | Form) -> tuple[Form, Form]:
+    """Return the derivative of F at uh, and F."""
+    residual = form(F)
+    if residual.rank != 1:
+        raise ValueError(
+            f"the form has {residual.rank} arguments and L is left out: give a and L of a linear problem, or the "
+            f"residual F(uh; v) of a nonlinear one, with one test function"
+        )
+    if uh not in residual.ufl_form.coefficients():
+        raise ValueError(
+            f"F does not depend on {uh}, whose error is wanted: it must have the solution itself in the place of the "
+            f"unknown; of a linear problem give a and L"
+        )
+    return form(ufl.derivative(residual.ufl_form, uh)), residual
 
 
 def _check_solved(V: FunctionSpace, singular: npt.NDArray[np.integer]) -> None:
@@ -74,9 +97,3 @@ def _check_problem(V: FunctionSpace, a: Form, L: Form) -> None:
     for given in (a, L):
         if not given.hierarchy.same_as(V.hierarchy):
             raise ValueError("a or L has functions on a refinement of the cells that indicators are wanted for")
-        if given.orders[0] > 1:
-            raise ValueError(
-                "a or L has second derivatives of the test function, but bubbles are not smooth enough across edges "
-                'for fourth-order equations: see "Estimating the error" in docs/fourth_order.md for residuals weighted '
-                "piece by piece"
-            )

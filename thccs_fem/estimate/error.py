@@ -46,7 +46,7 @@ def error(
     if norm == "H1":
         gradient = _tangential(V, ufl.grad(e))
         density += ufl.inner(gradient, gradient)
-    return np.sqrt(np.maximum(over_cells(V, density), 0.0))
+    return np.sqrt(np.maximum(over_cells(V, density * ufl.dx(domain=V.mesh.ufl_domain())), 0.0))
 
 
 def _tangential(V: FunctionSpace, gradient: Expr) -> Expr:

@@ -1,4 +1,4 @@
-"""Indicators, one a cell: densities integrated over each, and their sum."""
+"""Indicators, one a cell: integrals over each, and their sum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from thccs_fem.parallel import total
 __all__ = ["norm", "over_cells"]
 
 Floats = npt.NDArray[np.float64]
-Expr = ufl.core.expr.Expr
 QUADRATURE_DEGREE = 11  # 6 x 6 Gauss points: the error is no polynomial
 
 
@@ -23,13 +22,13 @@ def norm(V: FunctionSpace, eta: Floats) -> float:
     return float(np.sqrt(total(V.mesh.comm, np.sum(np.asarray(eta) ** 2))))
 
 
-def over_cells(V: FunctionSpace, density: Expr, measure: ufl.Measure = ufl.dx) -> Floats:
-    """Return the integral of a density over each cell of V, or its edges, shape (cells.num_owned,).
+def over_cells(V: FunctionSpace, integrals: ufl.Form) -> Floats:
+    """Return the integrals of a form over each cell of V, and its edges, shape (cells.num_owned,).
 
     Raises:
-        ValueError: If the density has functions on finer cells than those of V.
+        ValueError: If the form has functions on finer cells than those of V.
     """
-    compiled = form(density * measure(domain=V.mesh.ufl_domain()), quadrature_degree=QUADRATURE_DEGREE, on=V)
+    compiled = form(integrals, quadrature_degree=QUADRATURE_DEGREE, on=V)
     if compiled.cells is not V.integration_cells:
         raise ValueError("the expression has functions on a refinement of the cells that indicators are wanted for")
     return assemble_cells(compiled)

@@ -2,69 +2,147 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 import ufl
 from thccs_fem.estimate.indicators import over_cells
-from thccs_fem.fem.function import Function
+from thccs_fem.fem.function import Function, cell_sizes
+from thccs_fem.fem.space import FunctionSpace
 
 __all__ = ["residual"]
 
 Floats = npt.NDArray[np.float64]
 Expr = ufl.core.expr.Expr
+Conditions = Expr | Mapping[int, Expr] | None
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """What the squares of residuals are multiplied by, as powers of h: see `residual`.
+
+    Attributes:
+        strong: Factor of the strong residual; the power of h is the order of the equation.
+        flux: Factor of residuals of one derivative less, the power likewise.
+        moment: Factor of residuals of two derivatives less than these, of power 1.
+        of_piece: Exponent with which the size of the piece enters h, the rest is that of the cell.
+    """
+
+    strong: float
+    flux: float
+    moment: float
+    of_piece: float
+
+
+# Of cubic splines on a line with knots 1 apart. The error of a solution with a smooth u'''' is a Bernoulli polynomial
+# in each cell: u' is wrong by u'''' B_3 / 6 and u'' by u'''' B_2 / 2, which is the residual of -u'' = f, and the jumps
+# of u''' are u''''. Where u' or u'' itself jumps by 1, it is that far from quadratic and linear splines, squared.
+_OF_ORDER = {
+    2: _Weights(strong=1 / 42, flux=0.0749, moment=0.0, of_piece=0.5),
+    4: _Weights(strong=1 / 720, flux=1 / 720, moment=0.1443, of_piece=1.0),
+}
 
 
 def residual(
     uh: Function,
     strong_residual: Expr,
-    neumann: Expr | Mapping[int, Expr] | None = None,
+    neumann: Conditions = None,
     flux: Expr | None = None,
+    *,
+    order: int = 2,
+    moment: Conditions = None,
+    moments: Expr | None = None,
+    stiffness: Expr | float = 1.0,
 ) -> Floats:
-    """Return the residual indicators of a second-order problem.
+    """Return the residual indicators of a problem of second or fourth order, linear or not.
 
-    With h the root of the area of the cell K,
+    With K the cell, sums over its edges on the boundary and inside, and norms in L2,
 
-        eta^2 = h^2 |strong residual|^2_K + h |residual of the Neumann condition|^2 + h / 2 |jump of the flux|^2
+        order 2:  eta^2 = (h^2 |strong residual|_K^2 + 3.1 h |flux condition|^2 + 1.6 h |jump of the flux|^2) / 42
+        order 4:  eta^2 = (h^4 |strong residual|_K^2 + h^3 |flux condition|^2 + 0.5 h^3 |jump of the flux|^2
+                           + 104 h |moment condition|^2 + 52 h |jump of the moment|^2) / 720
 
-    in L2 norms over K and over its edges on the boundary and inside. For -div(kappa grad(u)) = f with
-    kappa grad(u).n = g on the edges tagged 2, say ::
+    They estimate the error of grad(u), and of grad(grad(u)): the factors are those for which this would be exact on
+    a line. Two examples, -div(kappa grad(u)) = f with kappa grad(u).n = g on the edges tagged 2, and a plate that is
+    simply supported there, in the notation of `thccs_fem.forms.plate` ::
 
         n, sigma = ufl.FacetNormal(msh), kappa * grad(uh)
-        estimate.residual(uh, f + div(sigma), neumann={2: g - dot(sigma, n)}, flux=sigma)
+        estimate.residual(uh, f + div(sigma), {2: g - dot(sigma, n)}, sigma)
 
-    Where kappa is smooth the flux jumps only at the bicubic caps of extraordinary vertices, along the edges that leave
-    these: the space is C1 elsewhere. Jumps are small there, and `flux` may be left out. Where kappa jumps it may not.
+        m = plate.moments(uh, D, nu)
+        estimate.residual(uh, f - div(div(m)), flux=div(m), order=4, moment={2: dot(dot(m, n), n)})
 
-    Near a reentrant corner second derivatives are not square-integrable: there the residual grows with the level of the
-    caps.
+    Where kappa is smooth the flux of a second-order problem jumps only at the bicubic caps of extraordinary vertices,
+    along the edges that leave these: jumps are small there, and `flux` may be left out. Where kappa jumps it may not.
+    That of a fourth-order problem has third derivatives, which jump across all edges: give it, as there are errors
+    that are seen nowhere else, as that of u = x^4 - y^4.
+
+    h is the root of the area of K, unless K consists of several pieces. At order 4 it is the size of the piece, the
+    root of |det J| at each point: near an extraordinary vertex fourth derivatives are not square-integrable. Nor are
+    second ones at a reentrant corner: at order 2 it is the geometric mean of both sizes. So indicators do not depend
+    on the level of the caps.
 
     Args:
         uh: The approximation; the indicators belong to its cells.
-        strong_residual: UFL expression in uh, e.g. f + div(grad(uh)).
-        neumann: Likewise on the boundary, where no values are prescribed: on all of it, or one for each edge tag.
-        flux: The vector (of a system: the tensor) whose normal part must not jump.
+        strong_residual: UFL expression in uh, e.g. f + div(grad(uh)), of a nonlinear problem likewise.
+        neumann: Likewise the residual of a condition on the flux, where no values are prescribed: on all of the
+            boundary, or one for each edge tag.
+        flux: The vector (of a system: the tensor) whose normal part must not jump; at order 4 div(m), m the moments.
+        order: That of the equation: 2, or 4.
+        moment: Residual of a condition on the moment, at order 4, where no slopes are prescribed; as `neumann`.
+        moments: The tensor whose normal part in both indices must not jump, at order 4: where the stiffness does.
+        stiffness: What the flux is of the gradient (at order 4 the moment of the second derivatives), kappa or D, by
+            which the squares are divided: then energy norms are estimated. Else residuals should be divided by it.
 
     Returns:
         Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
-        ValueError: If an expression has functions on finer cells, or an edge tag is unknown.
+        ValueError: If an expression has functions on finer cells, an edge tag is unknown, the order is neither 2 nor 4,
+            or there are moments at order 2.
     """
-    V = uh.function_space
-    h = np.sqrt(over_cells(V, ufl.as_ufl(1.0)))
-    squares = h**2 * over_cells(V, _square(strong_residual))
-    conditions = neumann.items() if isinstance(neumann, Mapping) else [("everywhere", neumann)]
-    for tag, condition in conditions:
-        if condition is not None:
-            squares += h * over_cells(V, _square(condition), ufl.ds(tag))
+    if order not in _OF_ORDER:
+        raise ValueError(f"order is {order!r}; residuals of equations of order 2 and 4 are known")
+    if order == 2 and not (moment is None and moments is None):
+        raise ValueError("moment or moments are given, but the order is 2: of plates and shells it is order=4")
+    V, weights = uh.function_space, _OF_ORDER[order]
+    h, n = _size(V, weights.of_piece), ufl.FacetNormal(V.mesh.ufl_domain())
+    terms = [(strong_residual, weights.strong, order, ufl.dx)]
+    terms += [(value, weights.flux, order - 1, ds) for value, ds in _on_boundary(neumann)]
+    terms += [(value, weights.moment, 1, ds) for value, ds in _on_boundary(moment)]
     if flux is not None:
-        jump = ufl.jump(flux, ufl.FacetNormal(V.mesh.ufl_domain()))
-        squares += h * over_cells(V, _square(jump), ufl.dS)  # which counts for both cells by half
+        terms.append((ufl.jump(flux, n), weights.flux, order - 1, ufl.dS))
+    if moments is not None:
+        across = ufl.inner(moments, ufl.outer(n, n))
+        terms.append((across("+") - across("-"), weights.moment, 1, ufl.dS))
+    integrals = [_weighted(V, factor * ufl.inner(r, r), h, power, stiffness, over) for r, factor, power, over in terms]
+    squares = over_cells(V, sum(integrals, ufl.Form([])))
     return np.sqrt(np.maximum(squares, 0.0))
 
 
-def _square(value: Expr) -> Expr:
-    return ufl.inner(value, value)
+def _on_boundary(conditions: Conditions) -> Iterator[tuple[Expr, ufl.Measure]]:
+    """Yield the residuals of conditions, and what each is integrated over."""
+    if isinstance(conditions, Mapping):
+        yield from ((condition, ufl.ds(tag)) for tag, condition in conditions.items())
+    elif conditions is not None:
+        yield conditions, ufl.ds
+
+
+def _size(V: FunctionSpace, of_piece: float) -> Expr:
+    """Return h, the size of the piece to a power and that of the cell to the rest of it."""
+    if V.integration_cells.quadrature_degree is not None:  # pieces are points, which have no size
+        return cell_sizes(V)
+    size = ufl.sqrt(ufl.algebra.Abs(ufl.JacobianDeterminant(V.mesh.ufl_domain())))
+    return size if of_piece == 1.0 else size**of_piece * cell_sizes(V) ** (1.0 - of_piece)
+
+
+def _weighted(
+    V: FunctionSpace, square: Expr, h: Expr, power: int, stiffness: Expr | float, measure: ufl.Measure
+) -> ufl.Form:
+    """Return the integral of h^power square / stiffness; an edge between cells counts for both by half."""
+    if measure.integral_type() == "interior_facet":
+        h, stiffness = ufl.avg(h), ufl.avg(ufl.as_ufl(stiffness))
+    return h**power / stiffness * square * measure(domain=V.mesh.ufl_domain())

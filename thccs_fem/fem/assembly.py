@@ -162,29 +162,33 @@ def integrals(V: FunctionSpace) -> Floats:
     return values
 
 
-def bubble_energies(a: Form, L: Form, u: Function) -> Floats:
+def bubble_energies(a: Form, L: Form, u: Function | None) -> Floats:
     """Return r^T K^-1 r for each cell, with K_ij = a(b_j, b_i) and r_i = L(b_i) - a(u, b_i) for its bubbles b.
 
-    Bubbles are the products of the cubic Bernstein polynomials 1 and 2 along the sides of the cell, in each component.
-    They vanish on facets, over which nothing is integrated.
+    Bubbles are, in each component, the products of two cubics along the sides of the cell: of the Bernstein polynomials
+    1 and 2, which vanish on facets; or, where a or L has second derivatives of the test function, of Hermite's that
+    have value or slope 1 in the middle of the side, and no normal derivative on facets either. Over these nothing is
+    integrated.
 
     Args:
         a: Bilinear form.
         L: Linear form.
-        u: Function in the space of all arguments, on whose cells both forms are integrated.
+        u: Function in the space of all arguments, on whose cells both forms are integrated; None for zero.
 
     Returns:
         Shape (cells.num_owned,): infinite where K is singular and the equations for K^-1 r have no solution.
     """
-    cells, block_size = a.cells, u.function_space.block_size
-    size = 4 * block_size
+    cells, block_size = a.cells, a.spaces[0].block_size
+    size, are_smooth = 4 * block_size, max(a.orders[0], L.orders[0]) > 1
     K, r = np.zeros((cells.num_cells, size, size)), np.zeros((cells.num_cells, size))
+    values = np.zeros((cells.num_dofs, block_size)) if u is None else u.x.array.reshape(-1, block_size)
     places = cells.piece_origin, cells.piece_axes
     for form in (a, L):
         for loop in cell_loops(form):
             of_pieces = [pointer(array[loop.first_piece :]) for array in places]
-            local = pointer(loop.batch.local(u.x.array.reshape(-1, block_size))) if form is a else library().ffi.NULL
-            loop.run(library().lib.thccs_assemble_on_bubbles, block_size, *of_pieces, local, pointer(K), pointer(r))
+            local = pointer(loop.batch.local(values)) if form is a else library().ffi.NULL
+            kind = block_size, are_smooth
+            loop.run(library().lib.thccs_assemble_on_bubbles, *kind, *of_pieces, local, pointer(K), pointer(r))
     energies = np.zeros(cells.num_cells)
     library().lib.thccs_solve_local(energies.size, size, *(pointer(array) for array in (K, r, r.copy(), energies)))
     return energies[: cells.num_owned]

@@ -17,7 +17,7 @@ import numpy.typing as npt
 import ufl
 from thccs_fem.extraction import evaluate_pieces
 from thccs_fem.fem.expression import ValueOrExpression
-from thccs_fem.fem.fitting import fitted, side_rows
+from thccs_fem.fem.fitting import boundary_rows, fitted
 from thccs_fem.fem.function import Constant, Function
 from thccs_fem.fem.space import Component, FunctionSpace, check_space
 from thccs_fem.parallel import together
@@ -101,8 +101,11 @@ def _on_boundary(V: FunctionSpace, marker: Marker | None, tag: int | None, slope
         points = cells.piece_points[piece]
         for position in side_points([0.0, 0.5, 1.0])[side].swapaxes(0, 1):
             chosen &= _marked(marker, evaluate_pieces(points, np.arange(piece.size, dtype=np.int32), position))
-    rows = side_rows(cells, piece[chosen], side[chosen], depth=2 if slope else 1)
-    return np.unique(rows.indices)
+    rows = boundary_rows(cells, depth=2 if slope else 1)
+    of_side = np.repeat(chosen, rows.shape[0] // max(piece.size, 1))
+    marks = np.zeros(cells.num_dofs, dtype=bool)
+    marks[rows.indices[np.repeat(of_side, np.diff(rows.indptr))]] = True
+    return np.flatnonzero(marks).astype(np.int32)
 
 
 def region_dofs(V: FunctionSpace, faces: npt.ArrayLike | None = None, *, tag: int | None = None) -> Ints:

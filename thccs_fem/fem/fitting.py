@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +25,10 @@ from thccs_fem.fem.expression import ValueOrExpression, values_at
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import gathered
 from thccs_fem.positions import side_points
+from thccs_fem.sparse import csr, product, restricted, rows_of, transposed, without_rounding
 from thccs_fem.subdivision import Bools, Ints
 
-__all__ = ["fitted", "side_rows"]
+__all__ = ["boundary_rows", "fitted"]
 
 NONZERO = 1e-10  # extraction entries are 0 up to rounding or a good part of 1 in some piece of the cell
 AROUND = 1e-6  # weight of a value around the part that is prescribed, against 1 in it
@@ -74,12 +76,12 @@ def fitted(V: FunctionSpace, functions: Indices, value: ValueOrExpression, k: in
         more_mass, more_load = part.equations()
         mass, load = mass + more_mass, load + more_load
     present = np.flatnonzero(mass.diagonal() > 0.0)
-    mass, load = sp.csc_array(mass[present][:, present]), load[present]
-    regular = mass.copy()
-    regular.setdiag((1.0 + RIDGE) * mass.diagonal())
-    factors = spla.splu(regular)
-    fitted = factors.solve(load)
-    fitted += factors.solve(load - mass @ fitted)  # takes back what RIDGE has changed
+    mass, load = restricted(mass, present, present), load[present]
+    is_diagonal = np.repeat(np.arange(present.size), np.diff(mass.indptr)) == mass.indices
+    regular = np.where(is_diagonal, (1.0 + RIDGE) * mass.data, mass.data)
+    factors = spla.splu(sp.csc_array((regular, mass.indices, mass.indptr), shape=mass.shape))  # of the transposed
+    fitted = factors.solve(load, "T")
+    fitted += factors.solve(load - mass @ fitted, "T")  # takes back what RIDGE has changed
     return fitted[np.searchsorted(present, numbers)]
 
 
@@ -120,8 +122,10 @@ class _Part:
         weighted = (np.where(is_finite, weights[:, :, None], 0.0) * self.basis).swapaxes(1, 2)
         mass, load = weighted @ self.basis, weighted @ np.where(is_finite, self.values, 0.0)
         n, m, _ = mass.shape
-        blocks = sp.bsr_array((mass, np.arange(n), np.arange(n + 1)), shape=(n * m, n * m))
-        return sp.csr_array(self.rows.T @ (blocks.tocsr() @ self.rows)), self.rows.T @ load.reshape(n * m, -1)
+        columns = np.repeat(np.arange(n * m, dtype=np.int32).reshape(n, m), m, axis=0)
+        blocks = csr(mass.ravel(), columns.ravel(), m * np.arange(n * m + 1, dtype=np.int32), (n * m, n * m))
+        to_functions = transposed(self.rows)
+        return product(to_functions, product(blocks, self.rows)), to_functions @ load.reshape(n * m, -1)
 
 
 def _of_all_ranks(V: FunctionSpace, part: _Part) -> _Part:
@@ -136,7 +140,8 @@ def _of_all_ranks(V: FunctionSpace, part: _Part) -> _Part:
         gathered(comm, array)
         for array in (np.diff(part.rows.indptr), functions.numbers[part.rows.indices], part.rows.data)
     )
-    rows = sp.csr_array((data, indices, np.append(0, np.cumsum(sizes))), shape=(sizes.size, functions.size_global))
+    indptr = np.append(0, np.cumsum(sizes)).astype(np.int32)
+    rows = csr(data, indices.astype(np.int32, copy=False), indptr, (sizes.size, functions.size_global))
     height = part.basis.shape[-1]
     basis = part.basis if part.basis.ndim == 2 else gathered(comm, part.basis)[order]
     weights, values = (gathered(comm, array)[order] for array in (part.weights, part.values))
@@ -146,8 +151,7 @@ def _of_all_ranks(V: FunctionSpace, part: _Part) -> _Part:
 
 def _on_boundary(V: FunctionSpace, given: Indices, value: ValueOrExpression, k: int) -> _Part | None:
     """Return the values at Gauss points of the boundary; None if a function has no trace there."""
-    piece, side = _own_sides(V.cells)
-    rows = side_rows(V.cells, piece, side, depth=1)
+    piece, side, rows = _own_sides(V.cells, depth=1)
     if _without_rows(V, given, rows).size:
         return None
     chosen, is_inside = _blocks(V, rows, given, 4)
@@ -168,8 +172,7 @@ def _value_and_slope(V: FunctionSpace, given: Indices, value: ValueOrExpression,
     """
     if not isinstance(value, ufl.core.expr.Expr):
         raise TypeError(f"slope=True needs a UFL expression, whose gradient is known, got {type(value).__name__}")
-    piece, side = _own_sides(V.cells)
-    rows = side_rows(V.cells, piece, side, depth=2)
+    piece, side, rows = _own_sides(V.cells, depth=2)
     inside = _without_rows(V, given, rows)
     if inside.size:
         raise ValueError(
@@ -208,11 +211,11 @@ def _on_cells(V: FunctionSpace, given: Indices, value: ValueOrExpression, k: int
     return _of_all_ranks(V, _Part(keys, _rows_of(all_rows, chosen, 16), basis, weights, values, is_inside))
 
 
-def _own_sides(cells: Cells) -> tuple[Ints, Ints]:
-    """Return the pieces of this rank's own cells on the boundary, and their sides there, both (n,)."""
+def _own_sides(cells: Cells, depth: int) -> tuple[Ints, Ints, sp.csr_array]:
+    """Return the pieces of this rank's own cells on the boundary, their sides there, both (n,), and `boundary_rows`."""
     piece, side, _ = cells.boundary_pieces
-    own = cells.piece_cell[piece] < cells.num_owned
-    return piece[own], side[own]
+    own = np.flatnonzero(cells.piece_cell[piece] < cells.num_owned)
+    return piece[own], side[own], _rows_of(boundary_rows(cells, depth), own, 4 * depth)
 
 
 def _own_pieces_near(V: FunctionSpace, given: Indices) -> Ints:
@@ -257,31 +260,45 @@ def _blocks(V: FunctionSpace, rows: sp.csr_array, functions: Indices, height: in
 
 def _rows_of(rows: sp.csr_array, blocks: Indices, height: int) -> sp.csr_array:
     """Return blocks of `height` rows."""
-    return sp.csr_array(rows[(height * blocks[:, None] + np.arange(height)).ravel()])
+    return rows_of(rows, (height * blocks[:, None] + np.arange(height)).ravel())
 
 
 # ---- Sides of pieces ----------------------------------------------------------------------------------------------
 
 
-def side_rows(cells: Cells, piece: Ints, side: Ints, depth: int) -> sp.csr_array:
-    """Return Bernstein coefficients of all functions at sides of pieces; what is rounding is zero, and not stored.
+_boundary_rows: WeakKeyDictionary[Cells, dict[int, sp.csr_array]] = WeakKeyDictionary()
+
+
+def boundary_rows(cells: Cells, depth: int) -> sp.csr_array:
+    """Return Bernstein coefficients of all functions at the sides of pieces that are on the boundary.
+
+    What is rounding is zero, and not stored. They are found once and kept as long as the cells are.
 
     Args:
-        cells: The cells.
-        piece: Piece of each side, shape (n,).
-        side: Number of the side in it, from corner k to k + 1, shape (n,).
+        cells: The cells; their `boundary_pieces` are the n sides.
         depth: 1: the four coefficients on the side. 2: then the four of the next row inside, which make up the slope.
 
     Returns:
         Shape (4 depth n, num_functions).
     """
-    to_bernstein = sp.kron(sp.eye_array(piece.size, format="csr"), sp.csr_array(element.TO_BERNSTEIN), format="csr")
+    kept = _boundary_rows.setdefault(cells, {})
+    if depth not in kept:
+        kept[depth] = _new_boundary_rows(cells, depth)
+    return kept[depth]
+
+
+def _new_boundary_rows(cells: Cells, depth: int) -> sp.csr_array:
+    piece, side, _ = cells.boundary_pieces
     local = SIDES[side][:, None] + np.arange(depth)[:, None] * INWARD[side][:, None, None]
-    rows = 16 * np.arange(piece.size)[:, None] + local.reshape(piece.size, 4 * depth)
-    coefficients = sp.csr_array(sp.csr_array(to_bernstein[rows.ravel()]) @ cells.rows(piece))
-    coefficients.data[np.abs(coefficients.data) < NONZERO] = 0.0
-    coefficients.eliminate_zeros()
-    return coefficients
+    num_rows = local.size
+    columns = np.repeat(np.arange(16 * piece.size, dtype=np.int32).reshape(-1, 16), 4 * depth, axis=0)
+    to_bernstein = csr(
+        element.TO_BERNSTEIN[local.ravel()].ravel(),
+        columns.ravel(),
+        16 * np.arange(num_rows + 1, dtype=np.int32),
+        (num_rows, 16 * piece.size),
+    )
+    return without_rounding(product(to_bernstein, cells.rows(piece)), NONZERO)
 
 
 class _Sides:

@@ -161,12 +161,11 @@ def form(
     if cells.quadrature_degree is not None:
         quadrature_degree = cells.quadrature_degree
         check_metadata(ufl_form, quadrature_degree)
-    ufl_form = _with_quadrature(ufl_form, quadrature_degree)
-    compiled, module = _compiled(ufl_form)
+    degrees, compiled, module = _compiled(ufl_form, quadrature_degree)
     given = ufl_form.coefficients()
     positions = [compiled.original_coefficient_positions[i] for i in range(compiled.num_coefficients)]
     return Form(
-        ufl_form=ufl_form,
+        ufl_form=_with_degrees(ufl_form, degrees),
         spaces=spaces,
         coefficients=tuple(given[i] for i in positions),
         constants=tuple(ufl_form.constants()),
@@ -201,7 +200,23 @@ def _transfers(finest: Hierarchy, spaces: Sequence[Space]) -> dict[Hierarchy, Pr
     }
 
 
-def _compiled(ufl_form: ufl.Form) -> tuple[Any, ModuleType]:
+_known: dict[tuple[str, int | None], tuple[list[int | None], Any, ModuleType]] = {}
+
+
+def _compiled(ufl_form: ufl.Form, degree: int | None) -> tuple[list[int | None], Any, ModuleType]:
+    """Return the degrees to be added to a form's integrals, the `ufcx_form`, and its module.
+
+    They are kept by the form's signature, which a process sees again and again: each step of an adaptive run has its
+    own spaces, but the same forms.
+    """
+    key = ufl_form.signature(), degree
+    if key not in _known:
+        degrees = _degrees(ufl_form, degree)
+        _known[key] = degrees, *_newly_compiled(_with_degrees(ufl_form, degrees))
+    return _known[key]
+
+
+def _newly_compiled(ufl_form: ufl.Form) -> tuple[Any, ModuleType]:
     """Return the `ufcx_form` and its module; say what UFL misses on facets."""
     try:
         (compiled,), module = jit.compile_forms([ufl_form])
@@ -215,14 +230,26 @@ def _compiled(ufl_form: ufl.Form) -> tuple[Any, ModuleType]:
     return compiled, module
 
 
-def _with_quadrature(ufl_form: ufl.Form, degree: int | None) -> ufl.Form:
-    """Return the form with a quadrature degree in the metadata of each integral that has none."""
-    integrals = []
+def _degrees(ufl_form: ufl.Form, degree: int | None) -> list[int | None]:
+    """Return the quadrature degree of each integral that has none in its metadata, None for the others."""
+    chosen: list[int | None] = []
     for integral in ufl_form.integrals():
         metadata = integral.metadata()
-        if "quadrature_degree" not in metadata and metadata.get("quadrature_rule") != "custom":
-            chosen = _quadrature_degree(integral) if degree is None else degree
-            integral = integral.reconstruct(metadata={**metadata, "quadrature_degree": chosen})
+        if "quadrature_degree" in metadata or metadata.get("quadrature_rule") == "custom":
+            chosen.append(None)
+        else:
+            chosen.append(_quadrature_degree(integral) if degree is None else degree)
+    return chosen
+
+
+def _with_degrees(ufl_form: ufl.Form, degrees: list[int | None]) -> ufl.Form:
+    """Return the form with quadrature degrees in the metadata of its integrals, where there are any to be added."""
+    if all(degree is None for degree in degrees):
+        return ufl_form
+    integrals = []
+    for integral, degree in zip(ufl_form.integrals(), degrees, strict=True):
+        if degree is not None:
+            integral = integral.reconstruct(metadata={**integral.metadata(), "quadrature_degree": degree})
         integrals.append(integral)
     return ufl.Form(integrals)
 

@@ -301,8 +301,21 @@ def drops_constants(a: Sequence[Sequence[Form | None]], spaces: Sequence[Functio
     return np.concatenate(found)
 
 
+_dropped: dict[tuple[str, int], Bools] = {}
+
+
 def _drops(a: Form, number: int) -> Bools:
-    """Return for each component of one argument whether the form is zero where it is constant."""
+    """Return for each component of one argument whether the form is zero where it is constant.
+
+    That is a matter of symbols, and kept by the compiled module, of which there is one for all forms of a signature.
+    """
+    key = a.module.__name__, number
+    if key not in _dropped:
+        _dropped[key] = _found_to_drop(a, number)
+    return _dropped[key]
+
+
+def _found_to_drop(a: Form, number: int) -> Bools:
     form = lowered(a.ufl_form)
     V = a.spaces[number]
     constants = [ufl.as_vector(unit.tolist()) for unit in np.eye(V.block_size)] if V.value_shape else [ufl.as_ufl(1.0)]

@@ -27,6 +27,7 @@ from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
 from thccs_fem.index_map import IndexMap
 from thccs_fem.mesh import ControlMesh
 from thccs_fem.partition import partition
+from thccs_fem.regions import Unit
 from thccs_fem.subdivision import Ints
 
 __all__ = ["CellwiseSpace", "Component", "FunctionSpace", "cellwise", "check_space", "functionspace"]
@@ -352,13 +353,25 @@ class Component:
 
 @overload
 def functionspace(
-    mesh: ControlMesh, element: ConstantElement, boundary: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL
+    mesh: ControlMesh,
+    element: ConstantElement,
+    boundary: BoundaryRule = "clamped",
+    *,
+    cap_level: int = CAP_LEVEL,
+    admissibility: int | None = None,
+    unit: Unit = "support",
 ) -> CellwiseSpace: ...
 
 
 @overload
 def functionspace(
-    mesh: ControlMesh, element: tuple[Any, ...], boundary: BoundaryRule = "clamped", *, cap_level: int = CAP_LEVEL
+    mesh: ControlMesh,
+    element: tuple[Any, ...],
+    boundary: BoundaryRule = "clamped",
+    *,
+    cap_level: int = CAP_LEVEL,
+    admissibility: int | None = None,
+    unit: Unit = "support",
 ) -> FunctionSpace: ...
 
 
@@ -368,6 +381,8 @@ def functionspace(
     boundary: BoundaryRule = "clamped",
     *,
     cap_level: int = CAP_LEVEL,
+    admissibility: int | None = None,
+    unit: Unit = "support",
 ) -> FunctionSpace | CellwiseSpace:
     """Return the THCCS space on the limit surface of a control mesh.
 
@@ -379,10 +394,14 @@ def functionspace(
         boundary).
         cap_level: Level at which a bicubic cap ends the cut at extraordinary vertices; deeper where refinement goes
             deeper.
+        admissibility: The class m of refinement: the functions that do not vanish on a cell belong to at most m
+            successive levels, m being 2 or more; what is refined takes more along for that. None: any levels may meet.
+        unit: What refining a function refines: its "support", two rings of faces around its vertex, or the "ring" of
+            faces at it, which needs fewer dofs and more steps (see docs/adaptivity.md).
 
     Raises:
         TypeError: If `mesh` is no control mesh.
-        ValueError: If the element is none of ours, or the planar surface folds.
+        ValueError: If the element is none of ours, or an option is out of range, or the planar surface folds.
         NotImplementedError: If the mesh has creases inside.
     """
     if not isinstance(mesh, ControlMesh):
@@ -392,7 +411,7 @@ def functionspace(
     value_shape = _value_shape(element)
     if element[0] == "DG":
         return CellwiseSpace(mesh, value_shape=value_shape)
-    hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level)
+    hierarchy = Hierarchy.on(mesh, boundary, cap_level=cap_level, admissibility=admissibility, unit=unit)
     space = FunctionSpace(hierarchy, value_shape)
     check_no_folds(space.cells)
     return space

@@ -74,8 +74,8 @@ class LinearProblem:
         L: Linear form.
         bcs: Conditions; where two prescribe the same dof, the later one holds. With several unknowns they are for that
             in whose space they are; where two are in the same one, give a list of conditions for each unknown.
-        u: Function that takes the solution, and has the initial guess if ``ksp_initial_guess_nonzero`` is set, or a
-            list of them; None: new ones.
+        u: Function that takes the solution, and has the initial guess if ``ksp_initial_guess_nonzero`` is set or
+            `start_from_u` was called, or a list of them; None: new ones.
         load: Vector that is added to the right-hand side, as of point loads, shape (num_dofs,); on several ranks local,
             as `fem.assemble_vector` returns it.
         petsc_options_prefix: What distinguishes the options of this problem, usually with "_" at the end.
@@ -140,6 +140,18 @@ class LinearProblem:
     def solver(self) -> PETSc.KSP:
         """The KSP."""
         return self._solver
+
+    def start_from_u(self) -> bool:
+        """Let `solve` start from the values of u, as ``ksp_initial_guess_nonzero`` does; return whether it will.
+
+        A direct solver does not look at them. An iterative one is done at the same residual as without, relative to the
+        right-hand side: the nearer to the solution the values are, the fewer iterations it takes.
+        """
+        chosen: Any = self._solver.getType()  # or None, other than the stubs say
+        is_large = self._kind == "nest" or self._system.layout.num_dofs > LARGEST_DIRECT
+        iterates = is_large if chosen is None else chosen != "preonly"
+        self._solver.setInitialGuessNonzero(iterates)
+        return iterates
 
     def solve(self) -> Any:
         """Assemble with the present values of coefficients, constants and conditions, and solve.
@@ -216,6 +228,7 @@ def choose(
         pc.setType("mg")
     elif size <= (LARGEST_DIRECT_FOURTH_ORDER if fourth_order else LARGEST_DIRECT):
         solver.setType("preonly")
+        solver.setInitialGuessNonzero(False)  # or PETSc would refuse it
         pc.setType("cholesky" if symmetric else "lu")
         if PETSc.Sys.hasExternalPackage("mumps"):
             pc.setFactorSolverType("mumps")

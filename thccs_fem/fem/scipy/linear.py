@@ -92,6 +92,10 @@ class LinearProblem:
         """The solution: a `Function`, or a list of them."""
         return self._system.u
 
+    def start_from_u(self) -> bool:
+        """Return False: no solver here starts from the values of u. That of `fem.petsc` may, and returns whether."""
+        return False
+
     def solve(self) -> Any:
         """Assemble with the present values of coefficients, constants and conditions, and solve.
 
