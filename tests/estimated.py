@@ -139,7 +139,7 @@ def elliptic(
         strong = lower(msh, u, slope) - div(k * slope) + div(k * grad(uh)) - lower(msh, uh, grad(uh))
         missing = dot(k * (slope - grad(uh)), n) if is_natural else None
         flux = k * grad(uh) if isinstance(k, fem.Function) else None  # else it jumps at caps alone, and little
-        return estimate.residual(uh, strong, missing, flux, stiffness=k)
+        return estimate.residual(uh, strong, missing, flux, stiffness=k, reaction=c)
 
     def bubble(uh: fem.Function) -> Floats:
         msh, (u, v) = uh.function_space.mesh, arguments(uh.function_space)
@@ -150,7 +150,7 @@ def elliptic(
 
 def two_materials() -> ControlMesh:
     """Return the square (-1, 1)^2 with face tag 1 on the right half."""
-    msh = generators.rectangle((4, 4))
+    msh = generators.rectangle((4, 4), (-1.0, -1.0), (1.0, 1.0))
     right = msh.vertices[msh.quads].mean(axis=1)[:, 0] > 0
     return ControlMesh(msh.vertices, msh.quads, face_tags=right.astype(int), corners=msh.corners)
 
@@ -333,7 +333,7 @@ def on_a_surface(mesh: Callable[[], ControlMesh], cap_level: int) -> Problem:
 
     def residual(uh: fem.Function) -> Floats:
         strong = biharmonic.strong_residual(uh, load(uh.function_space)) - uh
-        return estimate.residual(uh, strong, flux=grad(div(grad(uh))), order=4)
+        return estimate.residual(uh, strong, flux=grad(div(grad(uh))), order=4, reaction=1.0)
 
     def a(u: Expr, v: Expr) -> ufl.Form:
         return biharmonic.a(u, v) + u * v * dx
@@ -401,6 +401,7 @@ SECOND = {
     ),
     "reaction-diffusion, 0.1": lambda: elliptic(space(wheel(5)), wavy, kappa=lambda _: 0.1, c=1.0),
     "reaction-diffusion, 1e-3": lambda: elliptic(space(wheel(5)), wavy, kappa=lambda _: 1e-3, c=1.0),
+    "reaction-diffusion, 1e-6": lambda: elliptic(space(wheel(5)), wavy, kappa=lambda _: 1e-6, c=1.0),
     "advection-diffusion, 0.1": lambda: elliptic(space(wheel(5)), wavy, kappa=lambda _: 0.1, beta=(1.0, 0.5)),
     "advection-diffusion, 1e-3": lambda: elliptic(space(wheel(5)), wavy, kappa=lambda _: 1e-3, beta=(1.0, 0.5)),
     "elasticity": elastic,

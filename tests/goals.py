@@ -96,22 +96,32 @@ def mean_over_a_part(comm: Any = None) -> Problem:
 
 
 def flux_through_a_side(comm: Any = None) -> Problem:
-    """Return the heat that leaves through one side, weighted, where two sides are kept warm and one is heated."""
+    """Return the heat that leaves through one side, weighted, where two sides are kept warm and two are heated."""
+    return _heated(comm, lambda u, F, x, flux: ufl.sin(np.pi * x[1]) * flux(u) * ds(RIGHT))
+
+
+def flux_from_the_equations(comm: Any = None) -> Problem:
+    """Return the same heat as what is left of the equations for a function with that weight: of twice the order."""
+    return _heated(comm, lambda u, F, x, flux: F(u, x[0] * ufl.sin(np.pi * x[1])))
+
+
+def _heated(comm: Any, J: Callable[..., ufl.Form]) -> Problem:
     msh = square(comm)
     x, n = ufl.SpatialCoordinate(msh), ufl.FacetNormal(msh)
     exact = wavy(x)
     kappa = 1 + 0.5 * x[0]
-    heat = dot(kappa * grad(exact), n)
+
+    def flux(u: Expr) -> Expr:
+        return kappa * dot(grad(u), n)
 
     def F(u: Expr, v: Expr) -> ufl.Form:
         f = -ufl.div(kappa * grad(exact))
-        return poisson.a(u, v, kappa) - f * v * dx - heat * v * ds(TOP) - heat * v * ds(BOTTOM)
+        return poisson.a(u, v, kappa) - f * v * dx - flux(exact) * v * ds(TOP) - flux(exact) * v * ds(BOTTOM)
 
     def bcs(V: fem.FunctionSpace) -> list[fem.DirichletBC]:
         return [fem.dirichletbc(exact, fem.boundary_dofs(V, tag=tag), V) for tag in (LEFT, RIGHT)]
 
-    V = fem.functionspace(msh, ("THCCS", 3))
-    return Problem(V, F, lambda u: ufl.sin(np.pi * x[1]) * kappa * dot(grad(u), n) * ds(RIGHT), bcs, exact)
+    return Problem(fem.functionspace(msh, ("THCCS", 3)), F, lambda u: J(u, F, x, flux), bcs, exact)
 
 
 def with_advection(comm: Any = None) -> Problem:
@@ -272,6 +282,7 @@ def hot_conductor(comm: Any = None) -> Problem:
 LINEAR = {
     "mean over a part": mean_over_a_part,
     "flux through a side": flux_through_a_side,
+    "flux from the equations": flux_from_the_equations,
     "with advection": with_advection,
     "displacement of a side": displacement_of_a_side,
     "on a closed surface": on_a_closed_surface,

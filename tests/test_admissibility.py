@@ -10,11 +10,13 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from refinements import CASES, MESHES, STEPS, Choice, chosen
 from slow_hierarchy import SlowLevel, slow_stages, whole_levels
+from test_moving_fronts import drop, fitted, remeshed
 from test_remeshing import levels_on_cells
 
 from thccs_fem import adapt, checkpoint, fem, generators
 from thccs_fem.extraction import extract
 from thccs_fem.hierarchy import CAP_LEVEL, Hierarchy
+from thccs_fem.regions import Unit
 
 EXACT = 1e-12  # coefficients that are more than rounding
 CLASSES = [2, 3]
@@ -224,6 +226,16 @@ def test_spaces_and_files_have_it(tmp_path: Path) -> None:
         assert found.num_dofs == space.num_dofs
 
 
+def test_a_space_tells_what_differs_from_the_default() -> None:
+    texts = [
+        str(fem.functionspace(generators.wheel(5, 3), ("THCCS", 3), admissibility=m, unit=unit))
+        for m, unit in ((None, "support"), (3, "ring"))
+    ]
+    assert "rings" not in texts[0]
+    assert "clamped boundary, 1 levels, " in texts[0]
+    assert "clamped boundary, refined by rings, 1 levels, at most 3 on a cell, " in texts[1]
+
+
 def test_an_older_file_is_of_free_refinement_by_supports(tmp_path: Path) -> None:
     """Before there were classes and units a hierarchy had a rule and a cap level."""
     V = adapt.refine(fem.functionspace(generators.wheel(5, 3), ("THCCS", 3), admissibility=2, unit="ring"), [0])
@@ -238,6 +250,24 @@ def test_an_older_file_is_of_free_refinement_by_supports(tmp_path: Path) -> None
     found = checkpoint.read(path, mesh=V.mesh).functions["u"].function_space
     assert found == V
     assert (found.hierarchy.admissibility, found.hierarchy.unit) == (None, "support")
+
+
+# ---- Where fronts move
+
+
+@pytest.mark.parametrize(("unit", "m"), [("support", 2), ("support", 3), ("ring", None), ("ring", 2)])
+def test_a_front_leaves_little_behind(unit: Unit, m: int | None) -> None:
+    """A drop that is carried by six faces of the torus: space is given back, and the class holds at each step."""
+    start = fem.functionspace(generators.torus((24, 12)), ("THCCS", 3), unit=unit, admissibility=m)
+    V = fitted(drop(start, 0.0), start, most=0.2, finest=3).function_space
+    first, dofs, visited = V.num_dofs, [], V.hierarchy
+    for angle in np.linspace(0.0, np.pi / 2, 13)[1:]:
+        V = remeshed(fem.project(drop(V, angle), V), most=0.2, finest=3)
+        dofs.append(V.num_dofs)
+        visited = visited.common_refinement(V.hierarchy)
+        assert m is None or levels_on_cells(V.cells).max() <= m
+    assert visited.num_dofs > 1.3 * max(dofs)
+    assert max(dofs) < (1.35 if (unit, m) == ("ring", None) else 2.4) * first  # halves of supports can't go
 
 
 # ---- Wrong options

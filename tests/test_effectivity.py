@@ -17,6 +17,8 @@ BOUNDS = {
     ("kappa 1 and 10", "bubble"): (0.45, 0.7),
     ("Laplace-Beltrami, sphere", "residual"): (0.45, 0.95),
     ("reaction-diffusion, 0.1", "residual"): (0.45, 1.05),
+    ("reaction-diffusion, 1e-6", "residual"): (0.85, 1.1),
+    ("reaction-diffusion, 1e-6", "bubble"): (0.6, 0.95),
     ("advection-diffusion, 0.1", "residual"): (0.45, 1.05),
     ("advection-diffusion, 0.1", "bubble"): (0.45, 0.85),
     ("elasticity", "residual"): (0.4, 0.95),

@@ -287,18 +287,32 @@ def test_terms_of_fourth_order() -> None:
     np.testing.assert_allclose(eta**2, inside / kappa.x.array + jumps, rtol=1e-11)
 
 
+def test_reaction_bounds_the_weights() -> None:
+    """At its largest what is left of c u = f, over c; and what the flux of exp(-|x| sqrt(c / kappa)) jumps by."""
+    V = fem.functionspace(generators.rectangle((2, 1)), ("THCCS", 3))  # 2 cells of 1/2 x 1
+    uh, f, h, kappa, c = coordinate(V), fem.Constant(V.mesh, 3.0), np.sqrt(1 / 2), 1e-3, 7.0
+    for order, numbers in ((2, (1 / 42, 0.0749)), (4, (1 / 720, 1 / 720))):
+        eta = estimate.residual(uh, f, order=order, stiffness=kappa, reaction=c)
+        inside = 9 / 2 / (kappa / (numbers[0] * h**order) + c)
+        np.testing.assert_allclose(eta**2, inside, rtol=1e-12)
+        eta = estimate.residual(uh, f, f, order=order, stiffness=kappa, reaction=c)
+        power = order - 1
+        rim = 9 * 2.0 / (kappa / (numbers[1] * h**power) + kappa ** (1 / order) * c ** (power / order))
+        np.testing.assert_allclose(eta**2, inside + rim, rtol=1e-12)
+
+
 def test_factors_are_those_of_splines_on_a_line() -> None:
     """Of a long strip of cells the residual is the error: of x^4 / 24, and of 1 and x^2 / 2 on one side of a knot."""
-    V = fem.functionspace(generators.rectangle((24, 1), (-12.0, 0.0), (12.0, 1.0)), ("THCCS", 3))
+    V = fem.functionspace(generators.rectangle((64, 1), (-32.0, 0.0), (32.0, 1.0)), ("THCCS", 3))
     x, v = ufl.SpatialCoordinate(V.mesh)[0], ufl.TestFunction(V)
-    u, one, inside = ufl.TrialFunction(V), fem.Constant(V.mesh, 1.0), abs(V.cells.face - 11.5) < 5
+    u, one, inside = ufl.TrialFunction(V), fem.Constant(V.mesh, 1.0), abs(V.cells.face - 31.5) < 8
     right = fem.Function(fem.functionspace(V.mesh, ("DG", 0)))
-    right.x.array = 1.0 * (np.arange(24) >= 12)
+    right.x.array = 1.0 * (np.arange(64) >= 32)
 
     def solved(derivative: Callable[[ufl.core.expr.Expr], ufl.core.expr.Expr], wanted: ufl.core.expr.Expr) -> Floats:
         """Return the solution for which derivative(u) is closest to what is wanted, by u and slope at the ends."""
         a, L = ufl.inner(derivative(u), derivative(v)) * ufl.dx, wanted * derivative(v) * ufl.dx
-        bc = fem.dirichletbc(0.0, fem.locate_dofs_geometrical(V, lambda p: abs(p[0] + 12.0) < 0.5), V)
+        bc = fem.dirichletbc(0.0, fem.locate_dofs_geometrical(V, lambda p: p[0] < -31.5), V)
         return LinearProblem(a, L, bcs=[bc]).solve()
 
     def across(w: ufl.core.expr.Expr) -> ufl.core.expr.Expr:

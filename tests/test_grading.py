@@ -1,6 +1,7 @@
 """Grading towards irregular vertices: which cells get how fine, and that it depends on nothing else."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,6 +101,17 @@ def test_steps_behind_the_mesh_count_like_levels(make: Callable[[], ControlMesh]
     assert fine.num_dofs == whole.num_dofs
     for found, expected in zip(fine.hierarchy.refined_keys, whole.hierarchy.refined_keys[times:], strict=True):
         np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("options", [{"admissibility": 2}, {"admissibility": 3}, {"unit": "ring"}], ids=str)
+def test_other_ways_to_refine_have_at_least_the_same_cells(options: dict[str, Any]) -> None:
+    msh = generators.wheel(8, 2)
+    plain = adapt.grade_extraordinary(space(msh), 2)
+    other = adapt.grade_extraordinary(fem.functionspace(msh, ("THCCS", 3), **options), 2)
+    assert other.num_levels == plain.num_levels
+    for keys, least in zip(other.hierarchy.refined_keys, plain.hierarchy.refined_keys, strict=True):
+        assert np.isin(least, keys).all()
+    assert other.num_dofs < 1.2 * plain.num_dofs  # class 2 has a seam of two rings around the finest cells
 
 
 def test_wrong_arguments_are_named() -> None:

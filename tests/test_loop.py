@@ -266,6 +266,33 @@ def test_newton_starts_from_the_last_solution() -> None:
     assert few[-1] <= many[-1] - 2
 
 
+def test_a_guess_may_be_the_solution() -> None:
+    """Where nothing is left to do, Newton's method does nothing, however small the first residual is."""
+    problems: list[NonlinearProblem] = []
+
+    def problem(V: fem.FunctionSpace) -> NonlinearProblem:
+        u, v, x = fem.Function(V), ufl.TestFunction(V), ufl.SpatialCoordinate(V.mesh)[0]
+        bc = fem.dirichletbc(x, fem.boundary_dofs(V), V)
+        problems.append(NonlinearProblem(inner(grad(u), grad(v)) * dx + (u**3 - x**3) * v * dx, u, bcs=[bc]))
+        return problems[-1]
+
+    history = run(problem, lambda u: np.ones(u.function_space.num_cells))
+    assert len(problems[0].norms) > 3
+    assert max(len(p.norms) - 1 for p in problems[1:]) <= 1
+    assert estimate.error(history.solution, lambda x: x[0]).max() < 1e-13  # rounding
+
+
+def test_a_run_that_goes_on_starts_from_the_same_guess(tmp_path: Path) -> None:
+    """Newton's iterates depend on it, to the last digit."""
+    whole = run(newton, newton_residual, adapt.Stop(steps=4))
+    for steps in (1, 3, 4):
+        history = run(newton, newton_residual, adapt.Stop(steps=steps), checkpoint=tmp_path / "run.h5")
+        assert history.reason == f"{steps} of {steps} steps"
+    assert sizes(history) == sizes(whole)
+    np.testing.assert_array_equal(history["estimate"], whole["estimate"])
+    np.testing.assert_array_equal(history.solution.x.array, whole.solution.x.array)
+
+
 def two_unknowns(V: fem.FunctionSpace) -> LinearProblem:
     """Return the equation u - Laplace u = f, with a vector (u, -u) that goes along as an unknown of its own."""
     W = fem.FunctionSpace(V.hierarchy, (2,))
@@ -456,6 +483,9 @@ def test_columns_are_arrays() -> None:
         np.testing.assert_array_equal(history[name], expected)
         assert name in history.columns
     assert history["dofs"].dtype == np.int64
+    assert ("error" in history, "eror" in history) == (True, False)
+    assert list(dict(history)) == list(history.columns)
+    assert len(history) == 8
     with pytest.raises(KeyError, match="there is no column 'errors'; there are step, levels, elements, dofs, estimat"):
         history["errors"]
 

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from test_vtk import EXACT, NAMES, position, some_function, space
 from zoo import ZOO
 
-from thccs_fem import adapt, generators, plot
+from thccs_fem import generators, plot
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import functionspace
+from thccs_fem.plot import pictures, surfaces
 
 SIZE = (320, 240)
 WHITE = np.full(3, 255)
@@ -70,32 +71,32 @@ def test_facets_are_turned_as_their_normals(name: str) -> None:
 def test_facets_are_as_near_as_promised(monkeypatch: pytest.MonkeyPatch) -> None:
     V = functionspace(generators.cube_sphere(1), ("THCCS", 3))
     facets = plot.surface(V)
-    monkeypatch.setattr(plot, "GAP", plot.GAP / 10.0)
+    monkeypatch.setattr(surfaces, "GAP", surfaces.GAP / 10.0)
     finer = plot.surface(V)
     assert finer.n_cells > 2 * facets.n_cells
     finer = finer.compute_implicit_distance(facets.triangulate())
-    promised = plot.GAP * 10.0 * np.linalg.norm(np.ptp(V.cells.points, axis=0))
+    promised = surfaces.GAP * 10.0 * np.linalg.norm(np.ptp(V.cells.points, axis=0))
     assert np.abs(finer.point_data["implicit_distance"]).max() < 2.0 * promised  # facets are bent in two directions
 
 
 def test_values_are_as_near_as_promised(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plot, "FACET", 1.0)
+    monkeypatch.setattr(surfaces, "FACET", 1.0)
     V = functionspace(generators.rectangle((3, 3)), ("THCCS", 3))
     u = some_function(V)
     facets = plot.surface(u)
-    monkeypatch.setattr(plot, "SHADE", plot.SHADE / 10.0)
+    monkeypatch.setattr(surfaces, "SHADE", surfaces.SHADE / 10.0)
     finer = plot.surface(u)
     assert finer.n_cells > 2 * facets.n_cells
     drawn = finer.sample(facets)
     found = drawn.point_data["vtkValidPointMask"] == 1  # all but some on the rim
     assert found.mean() > 0.9
-    promised = plot.SHADE * 10.0 * np.ptp(u.local_coefficients())
+    promised = surfaces.SHADE * 10.0 * np.ptp(u.local_coefficients())
     errors = (drawn.point_data["u"] - finer.point_data["u"])[found]
     assert np.abs(errors).max() < 2.0 * promised  # facets are bent in two directions
 
 
 def test_only_the_range_of_values_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plot, "FACET", 1.0)
+    monkeypatch.setattr(surfaces, "FACET", 1.0)
     V = functionspace(generators.rectangle((3, 3)), ("THCCS", 3))
     u = some_function(V)
     num_facets = plot.surface(u).n_cells
@@ -109,9 +110,9 @@ def test_only_the_range_of_values_counts(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_no_more_facets_than_can_be_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     V = functionspace(generators.torus((6, 5)), ("THCCS", 3))
     assert plot.surface(V).n_cells > 2000
-    monkeypatch.setattr(plot, "MOST_FACETS", 2000)
+    monkeypatch.setattr(surfaces, "MOST_FACETS", 2000)
     assert 500 <= plot.surface(V).n_cells <= 2000
-    monkeypatch.setattr(plot, "MOST_FACETS", 1)
+    monkeypatch.setattr(surfaces, "MOST_FACETS", 1)
     assert plot.surface(V).n_cells == V.num_cells
 
 
@@ -166,7 +167,7 @@ def test_picture_has_no_holes(picture: Any) -> None:
     u = Function(functionspace(generators.disc(4), ("THCCS", 3)))
     image = picture(u, lines=False, clim=(-1.0, 2.0))
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
-    centre = SIZE[0] * (1.0 - plot.BAR) / 2.0
+    centre = SIZE[0] * (1.0 - pictures.BAR) / 2.0
     inside = np.hypot(x - centre, y - SIZE[1] / 2.0) < 0.4 * SIZE[1]
     assert len(np.unique(image[inside], axis=0)) == 1
 
@@ -268,7 +269,7 @@ def test_window_wants_a_display(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_picture_wants_opengl() -> None:
     window = SimpleNamespace(Initialize=lambda: None, IsCurrent=lambda: False)
     with pytest.raises(OSError, match=r"no OpenGL to draw with: install"):
-        plot._check_there_is_something_to_draw_on(SimpleNamespace(off_screen=True, render_window=window))
+        pictures._check_there_is_something_to_draw_on(SimpleNamespace(off_screen=True, render_window=window))
 
 
 def test_what_can_not_be_drawn(tmp_path: Path, picture: Any) -> None:
@@ -301,16 +302,16 @@ def test_what_can_not_be_drawn(tmp_path: Path, picture: Any) -> None:
 
 
 def test_constant_functions_have_a_range() -> None:
-    assert plot._range(np.zeros(3)) == (-0.5, 0.5)
-    assert plot._range(np.full(3, 4.0)) == (2.0, 6.0)
-    assert plot._range(np.array([-4.0, -4.0 + 1e-12])) == pytest.approx((-6.0, -2.0))
-    assert plot._range(np.array([1.0, 3.0, 2.0])) == (1.0, 3.0)
+    assert pictures._range(np.zeros(3)) == (-0.5, 0.5)
+    assert pictures._range(np.full(3, 4.0)) == (2.0, 6.0)
+    assert pictures._range(np.array([-4.0, -4.0 + 1e-12])) == pytest.approx((-6.0, -2.0))
+    assert pictures._range(np.array([1.0, 3.0, 2.0])) == (1.0, 3.0)
 
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6))
 def test_ticks_are_round_and_can_be_told_apart(low: float, width: float) -> None:
     high = low + width
-    ticks, form = plot._ticks(low, high)
+    ticks, form = pictures._ticks(low, high)
     assert 4 <= ticks.size <= 11
     assert low - 1e-6 * width <= ticks[0] < ticks[-1] <= high + 1e-6 * width
     labels = [form % tick for tick in ticks]
@@ -320,102 +321,3 @@ def test_ticks_are_round_and_can_be_told_apart(low: float, width: float) -> None
     # One digit, 1, 2 or 5, in the step.
     mantissa = (ticks[1] - ticks[0]) / 10.0 ** np.floor(np.log10((ticks[1] - ticks[0]) * (1.0 + 1e-6)))
     assert np.abs(mantissa - [1.0, 2.0, 5.0]).min() < 1e-6
-
-
-# ---- Convergence
-
-
-def falling(rate: float, num: int = 6, sign: float = 1.0) -> adapt.History:
-    dofs = 50 * 2 ** np.arange(num)
-    return adapt.History(
-        tuple(
-            adapt.Step(i, 1, 1, n, sign * 3.0 * n**-rate, 0.1, values={"error": 0.5 * n**-rate if i else 0.0})
-            for i, n in enumerate(dofs.tolist())
-        )
-    )
-
-
-def drawn(figure: Any) -> dict[str, np.ndarray]:
-    """Return the points of all curves by their labels."""
-    return {line.get_label(): line.get_xydata() for line in figure.axes[0].lines if line.get_label()[0] != "_"}
-
-
-def references(figure: Any) -> list[np.ndarray]:
-    return [line.get_xydata() for line in figure.axes[0].lines if line.get_label()[0] == "_"]
-
-
-def test_columns_of_runs_are_drawn(tmp_path: Path) -> None:
-    """On logarithmic scales, with nothing where there is none, and a colour for each run."""
-    runs = {
-        "adaptive": falling(1.5, sign=-1.0),
-        "uniform": falling(0.5, 3),
-        "other": {"dofs": [10, 20], "error": [2, 1]},
-    }
-    figure = plot.convergence(runs, tmp_path / "a.png", columns=("estimate", "error"), title="Rates")
-    curves = drawn(figure)
-    assert list(curves) == [
-        "adaptive, estimate",
-        "adaptive, error",
-        "uniform, estimate",
-        "uniform, error",
-        "other, error",
-    ]
-    dofs = runs["adaptive"]["dofs"]
-    np.testing.assert_allclose(curves["adaptive, estimate"], np.stack([dofs, 3.0 * dofs**-1.5], axis=1))
-    np.testing.assert_allclose(curves["adaptive, error"], np.stack([dofs, 0.5 * dofs**-1.5], axis=1)[1:])  # 0 before
-    np.testing.assert_array_equal(curves["other, error"], [[10, 2], [20, 1]])
-    (axes,) = figure.axes
-    assert (axes.get_xscale(), axes.get_yscale(), axes.get_title()) == ("log", "log", "Rates")
-    colours = [line.get_color() for line in axes.lines[:5]]
-    assert colours == ["C0", "C0", "C1", "C1", "C2"]
-    assert len({line.get_linestyle() for line in axes.lines[:2]}) == 2
-    height, width, _ = pyvista.read_texture(tmp_path / "a.png").to_array().shape
-    assert (height, width) == (750, 1050)
-
-
-def test_one_curve_needs_no_legend(tmp_path: Path) -> None:
-    figure = plot.convergence(falling(1.5), tmp_path / "a.pdf")
-    (axes,) = figure.axes
-    assert axes.get_legend() is None
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("dofs", "estimate")
-    assert (tmp_path / "a.pdf").read_bytes()[:4] == b"%PDF"
-    labels = drawn(plot.convergence({"a": falling(1.5), "b": falling(2.0)}, tmp_path / "b.svg"))
-    assert list(labels) == ["a", "b"]
-    assert list(drawn(plot.convergence(falling(1.5), tmp_path / "c.png", columns=["estimate", "error"]))) == [
-        "estimate",
-        "error",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("slopes", "letters"), [((1.5, 2.0), ["$N^{-3/2}$", "$N^{-2}$"]), ((0.63,), ["$N^{-0.63}$"]), ((), [])]
-)
-def test_slopes_are_below_the_curves(slopes: tuple[float, ...], letters: list[str], tmp_path: Path) -> None:
-    runs = {"adaptive": falling(1.7), "uniform": falling(0.5)}
-    figure = plot.convergence(runs, tmp_path / "a.png", slopes=slopes)
-    lines = references(figure)
-    assert [text.get_text() for text in figure.axes[0].texts] == letters
-    for line, slope in zip(lines, slopes, strict=True):
-        (x0, y0), (x1, y1) = line
-        assert -np.log(y1 / y0) / np.log(x1 / x0) == pytest.approx(slope)
-        for curve in drawn(figure).values():
-            below = y0 * (curve[:, 0] / x0) ** -slope
-            assert (below < curve[:, 1])[curve[:, 0] >= x0].all()
-
-
-def test_a_single_step_is_drawn(tmp_path: Path) -> None:
-    figure = plot.convergence(falling(1.5, 1), tmp_path / "a.png")
-    assert [len(line.get_xydata()) for line in figure.axes[0].lines] == [1]  # and no slopes
-
-
-def test_curves_that_can_not_be_drawn(tmp_path: Path) -> None:
-    with pytest.raises(KeyError, match="no run has a column 'eror' with values to draw"):
-        plot.convergence(falling(1.5), tmp_path / "a.png", columns=("error", "eror"))
-    with pytest.raises(KeyError, match="no run has a column 'estimate'"):
-        plot.convergence(adapt.History(), tmp_path / "a.png")
-    with pytest.raises(ValueError, match="there are no runs to draw: give a history, or several by name"):
-        plot.convergence({}, tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"to be called '.*a.txt', but the name must end in .*\.pdf, .*\.png"):
-        plot.convergence(falling(1.5), tmp_path / "a.txt")
-    with pytest.raises(FileNotFoundError, match="there is no directory"):
-        plot.convergence(falling(1.5), tmp_path / "none" / "a.png")

@@ -51,7 +51,7 @@ SIGNATURES = {
     "stam.evaluate": "valence, uv, derivatives=0",
     "quadrature.paper_cells": "hierarchy",
     "quadrature.without_caps": "depth",
-    "fem.functionspace": "msh, element, /, boundary=ANY",
+    "fem.functionspace": "msh, element, /, boundary=ANY, *, admissibility=None, unit='support'",
     "fem.FunctionSpace.sub": "self, component, /",
     "fem.FunctionSpace.ufl_domain": "self",
     "fem.FunctionSpace.with_integration": "self, rule",
@@ -100,7 +100,7 @@ SIGNATURES = {
     "fem.petsc.multigrid": "ksp, V",
     "estimate.error": "uh, u_exact, norm='L2'",
     "estimate.residual": "uh, strong_residual, neumann=None, flux=None, *, order=2, moment=None, moments=None, "
-    "stiffness=1.0",
+    "stiffness=1.0, reaction=0.0",
     "estimate.bubble": "uh, a, L=None",
     "estimate.goal": "uh, F, J, *, fixed=None, problem=ANY",
     "estimate.norm": "V, eta",

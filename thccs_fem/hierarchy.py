@@ -312,7 +312,8 @@ class Hierarchy:
             coarser = l + 1 - self.admissibility if self.admissibility is not None else -1
             if coarser >= 0:  # what was refined before has what it needs, unless that is to be coarsened
                 faces = region if cells.size else region & ~stage.refined
-                wanted[coarser] |= required(stage.level, faces, stages[coarser].boundary)
+                if faces.any():
+                    wanted[coarser] |= required(stage.level, faces, stages[coarser].boundary)
         if _same_keys(keys, self.refined_keys):
             return self
         return self._with(keys)

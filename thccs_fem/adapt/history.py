@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -110,10 +110,10 @@ class Stop:
 
 
 @dataclass(frozen=True)
-class History:
-    """Steps of an adaptive run and the last solution.
+class History(Mapping[str, npt.NDArray[Any]]):
+    """Steps of an adaptive run and the last solution: a mapping of columns, ``history["dofs"]``.
 
-    ``print(history)`` shows a table, ``history["dofs"]`` is a column of it. `plot.convergence` draws columns.
+    ``print(history)`` shows them as a table, `plot.convergence` draws them, and ``dict(history)`` is what others take.
 
     Attributes:
         steps: The steps.
@@ -141,6 +141,13 @@ class History:
         if column not in self.columns:
             raise KeyError(f"there is no column {column!r}; there are {', '.join(self.columns)}")
         return np.array([step.values.get(column, np.nan) for step in self.steps])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        """Return the number of columns."""
+        return len(self.columns)
 
     def rates(self, column: str = "estimate") -> Floats:
         """Return the rate r of a column that falls like dofs^-r from each step to the next, shape (num_steps,).

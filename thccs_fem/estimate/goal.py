@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -101,26 +102,25 @@ def goal(
         Indicators, shape (cells.num_owned,), those of the cells that this rank owns, and the estimate of J(u) - J(uh).
 
     Raises:
-        TypeError: If F or J is no UFL form, or `fixed` no function.
+        TypeError: If uh is no function, F or J no UFL form, or `fixed` no function of a space.
         ValueError: If F has not just one argument, of the space of uh, or J has any; or one of them does not depend on
             uh; or constants are free, and uh has not mean zero.
     """
     V = _checked_space(uh, F, J, fixed)
     W = _refined_everywhere(V)
     P = Prolongation(W.hierarchy, V.hierarchy)
-    given = _Equations(F, J, uh)
-    fine = given.at(_carried(P, uh, W))
+    given = coarse = _Equations(F, J, uh, V)
+    fine = middle = given.at(_carried(P, uh, W), W)
     (dofs, jump), (coarse_dofs, _) = _prescribed(fine.u, fixed), _prescribed(uh, fixed)
     fine.check_means(dofs)
-    middle, coarse = fine, given
     if not fine.is_linear:
-        step = fine.newton_step(dofs, jump, problem)
-        middle = coarse = fine.at(_plus(fine.u, step / 2.0))
-    z, z_h = middle.dual(W, dofs, problem), coarse.dual(V, coarse_dofs, problem)
+        halfway = _plus(fine.u, fine.newton_step(dofs, jump, problem) / 2.0)
+        middle, coarse = fine.at(halfway, W), fine.at(halfway, V)
+    z, z_h = middle.dual(dofs, problem), coarse.dual(coarse_dofs, problem)
     residual = fine.residual()
     shares = P.transposed(_by_functions(-(z.x.array - _carried(P, z_h, W).x.array) * residual, W))
     V.index_map.scatter_forward(shares)
-    change = middle.balance(W, dofs) * fine.u.x.array - z.x.array * residual
+    change = middle.balance(dofs) * fine.u.x.array - z.x.array * residual
     if total(V.mesh.comm, int(jump.any())):
         change[dofs] += jump * middle.sensitivity(z)[dofs]
     value = fine.goal() - given.goal() + total(V.mesh.comm, float(np.sum(change[: W.num_owned_dofs])))
@@ -129,52 +129,66 @@ def goal(
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """The residual F and the goal J as forms in u; F has a test function of any space."""
+    """The residual F, which has a test function of any space, and the goal J as forms in u, and their derivatives.
+
+    Attributes:
+        F: The residual.
+        J: The goal.
+        u: The function.
+        space: Space of the arguments of derivatives.
+    """
 
     F: ufl.Form
     J: ufl.Form
     u: Function
+    space: FunctionSpace
 
-    def at(self, u: Function) -> _Equations:
+    def at(self, u: Function, space: FunctionSpace) -> _Equations:
         """Return them as forms in another function."""
-        return _Equations(ufl.replace(self.F, {self.u: u}), ufl.replace(self.J, {self.u: u}), u)
+        return _Equations(ufl.replace(self.F, {self.u: u}), ufl.replace(self.J, {self.u: u}), u, space)
 
-    @property
-    def space(self) -> FunctionSpace:
-        """The space of u."""
-        return self.u.function_space
+    @cached_property
+    def slope(self) -> ufl.Form:
+        """J'(u; test)."""
+        return _derivative("J", self.J, self.u, ufl.TestFunction(self.space))
+
+    @cached_property
+    def adjoint(self) -> ufl.Form:
+        """F'(u; test, trial): the direction is the test function."""
+        return _derivative("F", self._tested(ufl.TrialFunction(self.space)), self.u, ufl.TestFunction(self.space))
 
     @property
     def is_linear(self) -> bool:
         """Whether u is in none of the derivatives."""
-        return self.u not in (*self._slope(self.space).coefficients(), *self._adjoint(self.space).coefficients())
+        return self.u not in (*self.slope.coefficients(), *self.adjoint.coefficients())
 
     def goal(self) -> float:
         """Return J(u)."""
         return total(self.space.mesh.comm, assemble_scalar(form(self.J)))
 
     def residual(self) -> Floats:
-        """Return F(u; phi) for all phi in the space of u, local, the owned part complete."""
+        """Return F(u; phi) for all phi, local, the owned part complete."""
         return assemble_vector(form(self._tested(ufl.TestFunction(self.space))))
 
     def sensitivity(self, z: Function) -> Floats:
-        """Return J'(u; phi) - F'(u; phi, z), zero but where something is prescribed; as `residual`."""
-        return assemble_vector(form(self._slope(self.space) - ufl.action(self._adjoint(self.space), z)))
+        """Return J'(u; phi) - F'(u; phi, z) for all phi, zero but where something is prescribed; as `residual`."""
+        return assemble_vector(form(self.slope - ufl.action(self.adjoint, z)))
 
-    def dual(self, V: FunctionSpace, dofs: Ints, problem: Callable[..., Any]) -> Function:
-        """Return z in V with F'(u; phi, z) = J'(u; phi) for all phi in V, all of them zero at the prescribed dofs."""
+    def dual(self, dofs: Ints, problem: Callable[..., Any]) -> Function:
+        """Return z with F'(u; phi, z) = J'(u; phi) for all phi, all of them zero at the prescribed dofs."""
         try:
-            return _solved(problem, self._adjoint(V), self._slope(V), DirichletBC(V, dofs, np.zeros(dofs.size)))
+            bc = DirichletBC(self.space, dofs, np.zeros(dofs.size))
+            return _solved(problem, self.adjoint, self.slope, bc)
         except (ValueError, RuntimeError) as error:
             error.add_note("This is the dual problem. See that `fixed` returns all that is prescribed for uh.")
             raise
 
-    def balance(self, V: FunctionSpace, dofs: Ints) -> Floats:
+    def balance(self, dofs: Ints) -> Floats:
         """Return what the load of the dual problem has been balanced with, see `_balance`."""
-        return _balance(self._adjoint(V), self._slope(V), V, dofs)
+        return _balance(self.adjoint, self.slope, self.space, dofs)
 
     def check_means(self, dofs: Ints) -> None:
-        """Raise if u has not mean zero where constants are free.
+        """Raise if u, which is in the space, has not mean zero where constants are free.
 
         Raises:
             ValueError: It has another mean.
@@ -183,7 +197,7 @@ class _Equations:
         sizes = integrals(V)[: V.index_map.size_local]
         values = self.u.x.array[: V.num_owned_dofs].reshape(sizes.size, V.block_size)
         mean, absolute = (total(V.mesh.comm, sizes @ each) for each in (values, np.abs(values)))
-        wrong = _free_components(self._adjoint(V), V, dofs) & (np.abs(mean) > MEAN * absolute)
+        wrong = _free_components(self.adjoint, V, dofs) & (np.abs(mean) > MEAN * absolute)
         if wrong.any():
             raise ValueError(
                 f"nothing is prescribed, and F and its derivative have gradients alone of component "
@@ -192,7 +206,7 @@ class _Equations:
             )
 
     def newton_step(self, dofs: Ints, values: Floats, problem: Callable[..., Any]) -> Floats:
-        """Return what a step of Newton's method adds to u, shape (num_local_dofs,)."""
+        """Return what a step of Newton's method adds to u, which is in the space, shape (num_local_dofs,)."""
         test, trial = ufl.TestFunction(self.space), ufl.TrialFunction(self.space)
         jacobian = _derivative("F", self._tested(test), self.u, trial)
         return _solved(problem, jacobian, -self._tested(test), DirichletBC(self.space, dofs, values)).x.array
@@ -200,12 +214,6 @@ class _Equations:
     def _tested(self, v: ufl.Argument) -> ufl.Form:
         (test,) = self.F.arguments()
         return ufl.replace(self.F, {test: v})
-
-    def _slope(self, V: FunctionSpace) -> ufl.Form:
-        return _derivative("J", self.J, self.u, ufl.TestFunction(V))
-
-    def _adjoint(self, V: FunctionSpace) -> ufl.Form:
-        return _derivative("F", self._tested(ufl.TrialFunction(V)), self.u, ufl.TestFunction(V))
 
 
 def _solved(problem: Callable[..., Any], a: ufl.Form, L: ufl.Form, bc: DirichletBC) -> Function:
@@ -296,7 +304,9 @@ def _derivative(name: str, what: ufl.Form, u: Function, direction: ufl.Argument)
     return derivative
 
 
-def _checked_space(uh: Function, F: object, J: object, fixed: object) -> FunctionSpace:
+def _checked_space(uh: object, F: object, J: object, fixed: object) -> FunctionSpace:
+    if not isinstance(uh, Function):
+        raise TypeError(f"uh is a {type(uh).__name__}; it must be a fem.Function, as goals are of one unknown")
     check_space(uh.ufl_function_space(), "goal")
     V = uh.function_space
     for name, given, rank in (("F", F, 1), ("J", J, 0)):

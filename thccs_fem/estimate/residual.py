@@ -56,6 +56,7 @@ def residual(
     moment: Conditions = None,
     moments: Expr | None = None,
     stiffness: Expr | float = 1.0,
+    reaction: Expr | float = 0.0,
 ) -> Floats:
     """Return the residual indicators of a problem of second or fourth order, linear or not.
 
@@ -85,6 +86,11 @@ def residual(
     second ones at a reentrant corner: at order 2 it is the geometric mean of both sizes. So indicators do not depend
     on the level of the caps.
 
+    Where `reaction` c is large an error reaches no farther than the length (stiffness / c)^(1 / order), and h^p / F, F
+    the factor of the term, is to be read as 1 / (F / h^p + (c / stiffness)^(p / order)). So the energy norm is
+    estimated, grad(u) with the weight kappa and u with c, however small kappa is (Verfürth, Robust a posteriori
+    error estimators for a singularly perturbed reaction-diffusion equation, Numer. Math. 78 (1998), 479-493).
+
     Args:
         uh: The approximation; the indicators belong to its cells.
         strong_residual: UFL expression in uh, e.g. f + div(grad(uh)), of a nonlinear problem likewise.
@@ -96,6 +102,7 @@ def residual(
         moments: The tensor whose normal part in both indices must not jump, at order 4: where the stiffness does.
         stiffness: What the flux is of the gradient (at order 4 the moment of the second derivatives), kappa or D, by
             which the squares are divided: then energy norms are estimated. Else residuals should be divided by it.
+        reaction: Coefficient c of a term c u in the equation, not negative.
 
     Returns:
         Shape (cells.num_owned,), those of the cells that this rank owns.
@@ -109,7 +116,7 @@ def residual(
     if order == 2 and not (moment is None and moments is None):
         raise ValueError("moment or moments are given, but the order is 2: of plates and shells it is order=4")
     V, weights = uh.function_space, _OF_ORDER[order]
-    h, n = _size(V, weights.of_piece), ufl.FacetNormal(V.mesh.ufl_domain())
+    n = ufl.FacetNormal(V.mesh.ufl_domain())
     terms = [(strong_residual, weights.strong, order, ufl.dx)]
     terms += [(value, weights.flux, order - 1, ds) for value, ds in _on_boundary(neumann)]
     terms += [(value, weights.moment, 1, ds) for value, ds in _on_boundary(moment)]
@@ -118,9 +125,13 @@ def residual(
     if moments is not None:
         across = ufl.inner(moments, ufl.outer(n, n))
         terms.append((across("+") - across("-"), weights.moment, 1, ufl.dS))
-    integrals = [_weighted(V, factor * ufl.inner(r, r), h, power, stiffness, over) for r, factor, power, over in terms]
-    squares = over_cells(V, sum(integrals, ufl.Form([])))
-    return np.sqrt(np.maximum(squares, 0.0))
+    sizes = [ufl.as_ufl(size) for size in (_size(V, weights.of_piece), stiffness, reaction)]
+    integrals = ufl.Form([])
+    for value, factor, power, over in terms:
+        h, k, c = (ufl.avg(size) for size in sizes) if over.integral_type() == "interior_facet" else sizes
+        weight = 1 / (k / (factor * h**power) + k * (c / k) ** (power / order))
+        integrals += weight * ufl.inner(value, value) * over(domain=V.mesh.ufl_domain())
+    return np.sqrt(np.maximum(over_cells(V, integrals), 0.0))
 
 
 def _on_boundary(conditions: Conditions) -> Iterator[tuple[Expr, ufl.Measure]]:
@@ -137,12 +148,3 @@ def _size(V: FunctionSpace, of_piece: float) -> Expr:
         return cell_sizes(V)
     size = ufl.sqrt(ufl.algebra.Abs(ufl.JacobianDeterminant(V.mesh.ufl_domain())))
     return size if of_piece == 1.0 else size**of_piece * cell_sizes(V) ** (1.0 - of_piece)
-
-
-def _weighted(
-    V: FunctionSpace, square: Expr, h: Expr, power: int, stiffness: Expr | float, measure: ufl.Measure
-) -> ufl.Form:
-    """Return the integral of h^power square / stiffness; an edge between cells counts for both by half."""
-    if measure.integral_type() == "interior_facet":
-        h, stiffness = ufl.avg(h), ufl.avg(ufl.as_ufl(stiffness))
-    return h**power / stiffness * square * measure(domain=V.mesh.ufl_domain())

@@ -216,9 +216,12 @@ class FunctionSpace(ufl.FunctionSpace, _OnRanks):
         return hash((id(self.mesh), self.hierarchy.rule, self.num_dofs, self.value_shape))
 
     def __str__(self) -> str:
+        hierarchy = self.hierarchy
+        rings = ", refined by rings" if hierarchy.unit == "ring" else ""
+        bound = "" if hierarchy.admissibility is None else f", at most {hierarchy.admissibility} on a cell"
         return (
-            f"FunctionSpace(THCCS degree 3, values {self.value_shape}, {self.hierarchy.rule} boundary, "
-            f"{self.num_levels} levels, {self.num_dofs} dofs)"
+            f"FunctionSpace(THCCS degree 3, values {self.value_shape}, {hierarchy.rule} boundary{rings}, "
+            f"{self.num_levels} levels{bound}, {self.num_dofs} dofs)"
         )
 
 

@@ -1,9 +1,9 @@
 """Effectivity of `estimate.goal` on the problems of tests/goals.py: the value by the error of the goal, which is known.
 
-    OMP_NUM_THREADS=1 python tests/benchmarks/goals.py [steps]
+    OMP_NUM_THREADS=1 python tests/benchmarks/goal_values.py [steps]
 
-On uniform meshes, "shares" being the sum of their absolute values by the error; then in an adaptive run on the L-domain.
-Last, the CPU time of an estimate, by that of solving the problem, both for the second time.
+On uniform meshes, with the sum of the absolute values of all shares, by the error as well; then in an adaptive run on
+the L-domain, with the CPU time of solving the problem and of the estimate, both for the second time.
 """
 
 import sys
@@ -23,8 +23,9 @@ from thccs_fem import adapt, estimate, fem
 STEPS = int(sys.argv[1]) if len(sys.argv) > 1 else 4
 
 
-def exact_value(problem: Problem) -> float:
-    V = uniformly_refined(problem.V, 2)
+def exact_value(problem: Problem, V: fem.FunctionSpace) -> float:
+    """Return J of the exact solution, integrated on cells that are finer than those of V."""
+    V = uniformly_refined(V)
     return fem.assemble_scalar(fem.form(problem.J(problem.exact), quadrature_degree=24, on=V))
 
 
@@ -33,7 +34,7 @@ def of_space(problem: Problem, V: fem.FunctionSpace, *, is_linear: bool) -> tupl
     uh = (problem.solve if is_linear else problem.solve_by_newton)(V)
     F, J = problem.forms(uh)
     eta, value = estimate.goal(uh, F, J, fixed=problem.bcs)
-    return exact_value(problem) - value_of(J), value, float(np.sum(eta**2))
+    return exact_value(problem, V) - value_of(J), value, float(np.sum(eta**2))
 
 
 def seconds(work: Callable[[], object]) -> float:
