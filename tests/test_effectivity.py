@@ -31,6 +31,7 @@ BOUNDS = {
     ("plate, square", "bubble"): (0.45, 0.7),
     ("plate, square, x^4 - y^4", "residual"): (0.6, 1.1),
     ("plate, square, supported", "residual"): (1.3, 1.9),
+    ("plate, square, free", "residual"): (1.1, 2.2),
     ("plate, wheel of 5", "residual"): (0.3, 0.95),
     ("plate, wheel of 5", "bubble"): (0.2, 0.4),
     ("plate, wheel of 8", "residual"): (0.4, 1.15),

@@ -1,12 +1,13 @@
 """What supports, rings and classes of admissibility take for equal errors, and what the spaces are like that come out.
 
     OMP_NUM_THREADS=1 python tests/benchmarks/refinement.py [problem ...]
+    OMP_NUM_THREADS=1 python tests/benchmarks/refinement.py cells.png
 
 Adaptive runs with Doerfler's marks. "dofs" are those at which the error reaches each of the tolerances, interpolated
 between steps (logarithms of both), "steps" and "CPU s" those of the run to the last one. Of the last space: the most
 functions on a cell, entries a row of the stiffness matrix (mean, most), its condition with the diagonal scaled to 1
 (conditions left out), iterations of conjugate gradients to 1e-10 with multigrid, and the most levels that meet on a
-cell. Tables are in docs/adaptivity.md.
+cell. Tables are in docs/adaptivity.md. Given the name of a picture it draws the cells of four runs instead.
 """
 
 import os
@@ -122,17 +123,24 @@ PROBLEMS = {
 # ---- Runs ------------------------------------------------------------------------------------------------------------
 
 
-def run(problem: Problem, unit: Unit, admissibility: int | None, theta: float) -> str:
-    start = time.process_time()
+def steps(
+    problem: Problem, unit: Unit, admissibility: int | None, theta: float, tolerance: float
+) -> tuple[list[tuple[float, float]], FunctionSpace]:
+    """Return dofs and errors of the steps of a run, and its last space."""
     V = fem.functionspace(problem.mesh, ("THCCS", 3), unit=unit, admissibility=admissibility, **problem.options)
     rows: list[tuple[float, float]] = []
     while True:
         uh = problem.equations(V, DIRECT).solve()
         error = estimate.error(uh, problem.exact, problem.norm)  # type: ignore[arg-type]  # "L2" or "H1"
         rows.append((V.num_dofs, estimate.norm(V, error)))
-        if rows[-1][1] <= problem.tolerances[-1] or len(rows) == MOST_STEPS or V.num_dofs > MOST_DOFS:
-            break
+        if rows[-1][1] <= tolerance or len(rows) == MOST_STEPS or V.num_dofs > MOST_DOFS:
+            return rows, V
         V = adapt.refine(V, adapt.mark(V, problem.drive(uh, error), theta=theta))
+
+
+def run(problem: Problem, unit: Unit, admissibility: int | None, theta: float) -> str:
+    start = time.process_time()
+    rows, V = steps(problem, unit, admissibility, theta, problem.tolerances[-1])
     seconds = time.process_time() - start
     dofs = " | ".join(dofs_at(np.array(rows), tolerance) for tolerance in problem.tolerances)
     return f"{unit} | {admissibility or 'free'} | {theta} | {dofs} | {len(rows)} | {seconds:.1f} | {shape(problem, V)}"
@@ -176,7 +184,35 @@ def levels_on_cells(V: FunctionSpace) -> int:
     )
 
 
+# ---- A picture -------------------------------------------------------------------------------------------------------
+
+
+def picture(path: str) -> None:
+    """Draw the cells that an L2 error of 1e-6 takes on the L-domain, with both units, free and of class 2."""
+    from matplotlib.collections import PolyCollection
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 2.9), layout="constrained")
+    for axes, (unit, admissibility) in zip(
+        figure.subplots(1, 4), [("support", None), ("support", 2), ("ring", None), ("ring", 2)], strict=True
+    ):
+        _, V = steps(PROBLEMS["L-domain, L2"], unit, admissibility, 0.5, 1e-6)  # type: ignore[arg-type]  # they are units
+        levels = [(V.hierarchy.points[l], V.hierarchy.stages[l]) for l in range(V.num_levels)]
+        corners = np.concatenate([points[stage.level.quads[stage.active_faces]] for points, stage in levels])
+        axes.add_collection(PolyCollection(corners, facecolors="white", edgecolors="black", linewidths=0.35))
+        axes.set_title(
+            f"{unit}, {'free' if admissibility is None else 'class 2'}\n{V.num_dofs} dofs", fontsize=9, pad=4
+        )
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        axes.axis("off")
+    figure.savefig(path, dpi=130)
+
+
 def main() -> None:
+    if len(sys.argv) > 1 and sys.argv[1].endswith(".png"):
+        picture(sys.argv[1])
+        return
     for name in sys.argv[1:] or PROBLEMS:
         problem = PROBLEMS[name]
         tolerances = " | ".join(f"dofs, {problem.norm} {tolerance:g}" for tolerance in problem.tolerances)

@@ -10,7 +10,7 @@ hierarchy, and solve the same equations.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -354,7 +354,11 @@ class _Sides:
         return np.concatenate([first, second], axis=2)
 
 
+@cache
 def _gauss() -> tuple[Floats, Floats]:
     """Return Gauss points and weights on [0, 1]."""
     t, w = np.polynomial.legendre.leggauss(NUM_GAUSS)
-    return (t + 1.0) / 2.0, w / 2.0
+    points, weights = (t + 1.0) / 2.0, w / 2.0
+    for array in (points, weights):
+        array.setflags(write=False)
+    return points, weights
