@@ -64,14 +64,13 @@ def value_of(J: ufl.Form) -> float:
 def tagged(msh: ControlMesh, comm: Any = None) -> ControlMesh:
     """Return a planar mesh with tags on its four sides, and 1 on the faces in the lower left part."""
     x = msh.vertices
-    sides = {}
-    for (i, j), (_, outer) in zip(msh.edges.tolist(), msh.edge_faces.tolist(), strict=True):
-        if outer < 0:
-            middle = (x[i] + x[j]) / 2
-            distances = [*(middle[0] - x.min(axis=0)[:1]), x[:, 0].max() - middle[0], middle[1] - x[:, 1].min()]
-            sides[i, j] = 1 + int(np.argmin([*distances, x[:, 1].max() - middle[1]]))
-    middles = x[msh.quads].mean(axis=1)
-    faces = (middles < (x.min(axis=0) + x.max(axis=0)) / 2).all(axis=1).astype(int)
+    low, high = x.min(axis=0), x.max(axis=0)
+    rim = msh.edges[msh.edge_faces[:, 1] < 0]
+    middles = x[rim].mean(axis=1)
+    distances = np.stack([middles - low, high - middles], axis=2)  # from LEFT and RIGHT, and from BOTTOM and TOP
+    nearest = LEFT + distances.reshape(-1, 4).argmin(axis=1)
+    sides = dict(zip(map(tuple, rim.tolist()), nearest.tolist(), strict=True))
+    faces = (x[msh.quads].mean(axis=1) < (low + high) / 2).all(axis=1).astype(int)
     return ControlMesh(x, msh.quads, face_tags=faces, edge_tags=sides, corners=msh.corners, comm=comm)
 
 

@@ -77,6 +77,21 @@ def geometry_dofs(hierarchy: Hierarchy) -> np.ndarray:
     return np.concatenate(values)
 
 
+def levels_on_cells(cells: Cells) -> np.ndarray:
+    """How many levels lie between that of a cell and the coarsest of a function on it, both counted, (num_cells,)."""
+    level_of_dof = np.repeat(np.arange(cells.hierarchy.num_levels), np.diff(cells.hierarchy.dof_offsets))
+    coarsest = np.zeros(cells.num_cells, dtype=int)
+    for batch in cells.batches:
+        levels = np.where(batch.dofs >= 0, level_of_dof[batch.dofs], cells.hierarchy.num_levels)
+        coarsest[batch.cells] = levels.min(axis=1)
+    return cells.level - coarsest + 1
+
+
+def most_functions(cells: Cells) -> int:
+    """The largest number of functions on a cell."""
+    return max(int((batch.dofs >= 0).sum(axis=1).max()) for batch in cells.batches)
+
+
 def random_positions(hierarchy: Hierarchy, count: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points all over the control mesh: faces, coordinates, and corners (for sub-quads of polygons too)."""
     rng = np.random.default_rng(seed)

@@ -8,10 +8,9 @@ import numpy.typing as npt
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from refinements import CASES, MESHES, STEPS, Choice, chosen
+from refinements import CASES, MESHES, STEPS, Choice, chosen, levels_on_cells, most_functions
 from slow_hierarchy import SlowLevel, slow_stages, whole_levels
 from test_moving_fronts import drop, fitted, remeshed
-from test_remeshing import levels_on_cells
 
 from thccs_fem import adapt, checkpoint, fem, generators
 from thccs_fem.extraction import extract
@@ -85,11 +84,7 @@ def test_free_refinement_knows_no_bound(unit: str, times: int) -> None:
     assert found == [times + 2, *CLASSES]
     assert free.num_dofs < closed[1].num_dofs < closed[0].num_dofs
     if unit == "support":
-        assert [most_functions(h) for h in (free, *closed)] == [32, 21, 28]  # 16 where one level is alone
-
-
-def most_functions(hierarchy: Hierarchy) -> int:
-    return max(int((batch.dofs >= 0).sum(axis=1).max()) for batch in extract(hierarchy).batches)
+        assert [most_functions(extract(h)) for h in (free, *closed)] == [32, 21, 28]  # 16 where one level is alone
 
 
 # ---- What is refined for it
@@ -279,6 +274,12 @@ def test_a_class_below_two_is_refused(m: int) -> None:
         ValueError, match=f"admissibility is {m}; where refinement ends two levels meet: give 2 or more"
     ):
         fem.functionspace(generators.wheel(5, 2), ("THCCS", 3), admissibility=m)
+
+
+@pytest.mark.parametrize("m", [2.5, 2.0, "2"], ids=repr)
+def test_a_class_is_an_integer(m: float | str) -> None:
+    with pytest.raises(TypeError, match=f"admissibility is {m!r}; it must be an integer of 2 or more, or None"):
+        fem.functionspace(generators.wheel(5, 2), ("THCCS", 3), admissibility=m)  # type: ignore[call-overload]
 
 
 def test_an_unknown_unit_is_refused() -> None:

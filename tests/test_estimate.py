@@ -126,6 +126,22 @@ def test_error_against_a_function_of_a_finer_space_is_refused() -> None:
         estimate.error(fem.Function(coarse), with_random_values(randomly_refined(coarse)))
 
 
+def test_exact_solutions_may_be_numbers() -> None:
+    V = planar(times=0)
+    u = with_random_values(V)
+    for exact in (2.0, 2, lambda x: 2.0, fem.Constant(V.mesh, 2.0)):
+        np.testing.assert_allclose(estimate.error(u, exact, "H1"), estimate.error(u, ufl.as_ufl(2.0), "H1"), rtol=1e-14)
+
+
+@pytest.mark.parametrize("estimator", [estimate.error, estimate.residual, estimate.bubble])
+def test_what_is_estimated_is_one_function(estimator: Callable[..., Floats]) -> None:
+    uh = fem.Function(planar(times=0))
+    with pytest.raises(TypeError, match=r"uh is of type list; it must be a fem.Function. Of several unknowns give one"):
+        estimator([uh], uh)
+    with pytest.raises(TypeError, match=r"uh is of type FunctionSpace; it must be a fem.Function.$"):
+        estimator(uh.function_space, uh)
+
+
 def test_unknown_norm_is_named() -> None:
     with pytest.raises(ValueError, match="norm is 'H2'; it must be"):
         estimate.error(fem.Function(planar(times=0)), wavy, "H2")
@@ -338,6 +354,21 @@ def test_level_of_the_caps_does_not_matter() -> None:
         uh = poisson(V, singular(ufl.SpatialCoordinate(V.mesh)), fem.Constant(V.mesh, 0.0))
         found.append(estimate.norm(V, estimate.residual(uh, div(grad(uh)))))
     assert max(found) < 1.1 * min(found)  # by the size of the cell alone, 7 times
+
+
+def test_a_form_is_no_strong_residual() -> None:
+    uh = fem.Function(planar(times=0))
+    strong, v = div(grad(uh)), ufl.TestFunction(uh.function_space)
+    with pytest.raises(TypeError, match=r"the strong residual is of type Form: give an expression, such as f"):
+        estimate.residual(uh, strong * v * ufl.dx)  # type: ignore[arg-type]  # what is refused
+
+
+@pytest.mark.parametrize("weight", [{"stiffness": 0.0}, {"stiffness": -1.0}, {"reaction": -1}, {"stiffness": np.nan}])
+def test_negative_weights_are_refused(weight: dict[str, float]) -> None:
+    """Indicators would be zero, and runs end as if nothing was wrong."""
+    (name,) = weight
+    with pytest.raises(ValueError, match=rf"{name} is \S+; it must "):
+        estimate.residual(fem.Function(planar(times=0)), ufl.as_ufl(1.0), **weight)
 
 
 def test_unknown_orders_and_moments_of_the_second_order_are_refused() -> None:

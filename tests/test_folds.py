@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from zoo import ZOO
 
-from thccs_fem import generators
+from thccs_fem import folds, generators
 from thccs_fem.extraction import Cells, evaluate_pieces, extract
 from thccs_fem.folds import FOLD_LEVEL, check_no_folds
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.subdivision import subdivide
 
 
 def cells_of(mesh: ControlMesh) -> Cells:
@@ -139,3 +140,26 @@ def test_uneven_spacing_at_a_reentrant_corner_folds():
     text = message(ControlMesh(points[used], faces.reshape(-1, 4), corners={reentrant: math.inf}))
     assert f"at level 5 at the tagged corner, vertex {reentrant} with 3 faces" in text
     assert "even out the spacing" in text
+
+
+@pytest.mark.parametrize("make", [lambda: generators.l_domain(4), generators.l_domain2, lambda: generators.l_domain(1)])
+def test_levels_that_are_alike_have_the_patches_of_those_made_anew(make, monkeypatch):
+    cells = cells_of(make())
+    found, made = [], []
+
+    def recorded(patches):
+        found.append(patches)
+        return np.zeros(len(patches), dtype=bool)
+
+    def counted(*arguments):
+        made.append(arguments)
+        return subdivide(*arguments)
+
+    monkeypatch.setattr(folds, "_folds", recorded)
+    monkeypatch.setattr(folds, "subdivide", counted)
+    check_no_folds(cells)
+    assert 0 < len(made) < FOLD_LEVEL
+    monkeypatch.setattr(folds, "_is_alike", lambda level, fine: False)
+    check_no_folds(cells)
+    for ours, anew in zip(found[:2], found[2:], strict=True):
+        np.testing.assert_array_equal(ours, anew)

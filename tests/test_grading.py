@@ -120,5 +120,9 @@ def test_wrong_arguments_are_named() -> None:
         adapt.grade_extraordinary(V, -1)
     with pytest.raises(ValueError, match="subdivided is -2: expected 0 or more"):
         adapt.grade_extraordinary(V, 1, subdivided=-2)
+    with pytest.raises(TypeError, match=r"levels is 1.5: expected an integer"):
+        adapt.grade_extraordinary(V, 1.5)  # type: ignore[arg-type]  # the wrong argument
+    with pytest.raises(TypeError, match=r"subdivided is 0.5: expected an integer"):
+        adapt.grade_extraordinary(V, 0, subdivided=0.5)  # type: ignore[arg-type]  # the wrong argument
     with pytest.raises(TypeError, match="grading needs a space"):
         adapt.grade_extraordinary(V.mesh, 1)  # type: ignore[arg-type]  # the wrong argument

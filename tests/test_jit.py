@@ -186,3 +186,10 @@ def test_tables_keep_small_products() -> None:
     # int B_0 B_3 = 1 / 5040 and int B_0 B_0 = 20 / 5040 on [0, 1]; functions 0, 3, 12, 15 are at the corners.
     expected = np.array([[400, 20, 20, 1], [20, 400, 1, 20], [20, 1, 400, 20], [1, 20, 20, 400]]) / 5040**2
     np.testing.assert_allclose(tensor[np.ix_([0, 3, 12, 15], [0, 3, 12, 15])], expected, rtol=1e-11)  # tables: 1e-15
+
+
+def test_points_that_differ_by_little_are_not_confused() -> None:
+    x = ufl.SpatialCoordinate(generators.rectangle((1, 1)).ufl_domain())
+    points = np.array([[0.25, 0.5]])
+    names = {jit.compile_expression(x[0], points + shift)[1].__file__ for shift in (0.0, 1e-12, 0.0)}
+    assert len(names) == 2

@@ -84,6 +84,21 @@ def test_remeshed_hierarchies_have_the_bits_of_those_made_anew(case, seeds, cap)
     check_same(everything(hierarchy.with_caps_at(cap + 2)), everything(deeper))
 
 
+@settings(max_examples=8)
+@given(case=st.sampled_from(CASES), seeds=st.lists(st.integers(0, 2**32 - 1), min_size=1, max_size=4))
+def test_completed_outlines_have_the_bits_of_hierarchies_that_were_whole_all_along(case, seeds):
+    name, rule = case
+    whole = Hierarchy.on(MESHES[name], rule)
+    whole = whole.refined(np.arange(0, whole.num_dofs, 3))
+    outline = whole.outlined()
+    for seed in seeds:
+        dofs = np.random.default_rng(seed).choice(whole.num_dofs, 2, replace=False)
+        whole, outline = whole.refined(dofs), outline.refined(dofs)
+        assert [stage.active.tolist() for stage in outline.stages] == [stage.active.tolist() for stage in whole.stages]
+    assert any(not stage.is_whole for stage in outline.stages)
+    check_same(everything(outline.completed()), everything(whole))
+
+
 def test_a_refined_part_that_moves_takes_nothing_over():
     mesh = generators.torus((16, 8))  # where all places look alike: parts have equally many faces everywhere
     hierarchy = Hierarchy.on(mesh).refined(np.array([0]))

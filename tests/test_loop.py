@@ -12,7 +12,7 @@ from problems import poisson, wavy
 from spaces import space
 
 import ufl
-from thccs_fem import adapt, checkpoint, estimate, fem
+from thccs_fem import adapt, checkpoint, estimate, fem, generators
 from thccs_fem.fem.scipy import LinearProblem, NonlinearProblem
 from ufl import dx, grad, inner
 
@@ -142,6 +142,13 @@ def test_anything_that_looks_at_the_history_may_end_a_run() -> None:
     assert (len(history.steps), history.reason) == (3, "slow")
 
 
+@pytest.mark.parametrize("returned", [False, True, 0.5], ids=repr)
+def test_an_end_has_its_reason(returned: Any) -> None:
+    """A comparison that is False would end the run, too, as it is not None."""
+    with pytest.raises(TypeError, match=f"stop returned {returned}: return text, why the run ends, or None to go on"):
+        run(stop=lambda history: returned)
+
+
 def test_run_ends_where_nothing_is_wrong() -> None:
     history = run(lambda V: fem.Function(V), lambda u: np.zeros(u.function_space.num_cells))
     assert (len(history.steps), history.steps[0].estimate) == (1, 0.0)
@@ -163,6 +170,8 @@ def test_run_ends_where_nothing_is_wrong() -> None:
         ({"dofs": 1e4}, TypeError, "dofs is 10000.0; it must be an integer"),
         ({"seconds": 0.0}, ValueError, "seconds is 0.0; it must be positive"),
         ({"seconds": np.nan, "steps": 1}, ValueError, "seconds is nan"),
+        ({"seconds": "1"}, TypeError, "seconds is '1'; it must be a number"),
+        ({"tolerance": None, "steps": 1}, TypeError, "tolerance is None; it must be a number"),
     ],
 )
 def test_ends_are_checked(given: Mapping[str, Any], error: type[Exception], message: str) -> None:
@@ -359,6 +368,75 @@ def test_a_solution_in_another_space_is_refused() -> None:
     once = solve_poisson(space("grid"))
     with pytest.raises(ValueError, match=r"called with FunctionSpace\(.* 2 levels, .*solution is in .* 1 levels, 42"):
         run(lambda V: once)
+    other = fem.functionspace(generators.rectangle((4, 3)), ("THCCS", 3))
+    with pytest.raises(
+        ValueError, match=r"its solution is in FunctionSpace\(.* dofs\) on another mesh: make its forms"
+    ):
+        run(lambda V: fem.Function(other))
+    for constant in (fem.functionspace(other.mesh, ("DG", 0)), fem.space.cellwise(other)):
+        with pytest.raises(ValueError, match=r"its solution is in CellwiseSpace\("):
+            run(lambda V, constant=constant: fem.Function(constant))
+
+
+def test_some_unknowns_may_be_in_finer_spaces(tmp_path: Path) -> None:
+    """As velocities are, of pressures in V, whichever comes first; also from a checkpoint."""
+
+    def problem(V: fem.FunctionSpace) -> list[fem.Function]:
+        finer = adapt.refine(V, np.arange(V.num_functions))
+        return [fem.Function(fem.FunctionSpace(finer.hierarchy, (2,)), "velocity"), solve_poisson(V)]
+
+    def of_the_second(u: list[fem.Function]) -> Floats:
+        return exact_error(u[1])
+
+    alone = run(stop=adapt.Stop(steps=2))
+    whole = run(problem, of_the_second, adapt.Stop(steps=2))
+    run(problem, of_the_second, adapt.Stop(steps=1), checkpoint=tmp_path / "run.h5")
+    continued = run(problem, of_the_second, adapt.Stop(steps=2), checkpoint=tmp_path / "run.h5")
+    assert sizes(whole) == sizes(continued)
+    assert whole["elements"].tolist() == alone["elements"].tolist()
+    assert whole.steps[0].dofs == 42 + 2 * adapt.refine(space("grid"), np.arange(42)).num_dofs
+
+
+def test_unknowns_stay_the_same(tmp_path: Path) -> None:
+    run(stop=adapt.Stop(steps=1), checkpoint=tmp_path / "run.h5")
+    for unknowns, shapes in (([(), ()], r"\[\(\), \(\)\]"), ([(2,)], r"\[\(2,\)\]")):
+
+        def problem(V: fem.FunctionSpace, unknowns: Any = unknowns) -> Own:
+            return Own([fem.Function(fem.FunctionSpace(V.hierarchy, shape)) for shape in unknowns], [])
+
+        with pytest.raises(
+            ValueError, match=rf"unknowns with values of shape {shapes}, the last solution \[\(\)\]: pose"
+        ):
+            run(problem, checkpoint=tmp_path / "run.h5")
+
+
+@pytest.mark.parametrize("options", [{"unit": "ring"}, {"admissibility": 2}, {"boundary": "crease"}], ids=repr)
+def test_a_run_goes_on_in_the_space_that_it_began_with(tmp_path: Path, options: dict[str, Any]) -> None:
+    """A space that is refined in another way would be left as it was in the file, and nobody told."""
+    run(stop=adapt.Stop(steps=1), checkpoint=tmp_path / "run.h5")
+    V = fem.functionspace(space("grid").mesh, ("THCCS", 3), **options)
+    with pytest.raises(ValueError, match="of a run that began with 42 dofs in another space than FunctionSpace"):
+        adapt.solve(V, solve_poisson, exact_error, stop=THREE, checkpoint=tmp_path / "run.h5", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "message"),
+    [
+        ("problem", Own(None, []), "problem is of type Own: give a function of the space, such as lambda V: Lin"),
+        ("estimator", np.ones(12), "estimator is of type ndarray: give a function of the solution"),
+        ("marking", "dorfler", r'marking is of type str: give a function of .*, such as adapt.Marking\("dorfler", 0.5'),
+        ("stop", 1e-3, r"stop is of type float: give a function of the history, such as adapt.Stop\(tolerance"),
+        ("callback", [print], "callback is of type list: give a function of the step and the solution"),
+        ("V", space("grid").mesh, r"adapt.solve needs a space from fem.functionspace\(.*, got ControlMesh"),
+    ],
+)
+def test_arguments_are_checked_before_anything_is_solved(name: str, given: Any, message: str) -> None:
+    def refused(V: fem.FunctionSpace) -> fem.Function:
+        raise AssertionError("solved")
+
+    arguments = {"V": space("grid"), "problem": refused, "estimator": exact_error, "stop": THREE} | {name: given}
+    with pytest.raises(TypeError, match=message):
+        adapt.solve(**arguments)
 
 
 # ---- Estimates and marks
@@ -378,6 +456,43 @@ def test_an_estimate_need_not_be_the_norm_of_the_indicators() -> None:
 def test_indicators_are_one_a_cell(returned: Any) -> None:
     with pytest.raises(ValueError, match=r"indicators of shape .*; it needs one for each of the 12 cells"):
         run(estimator=lambda u: returned)
+
+
+@pytest.mark.parametrize(
+    ("returned", "kind"),
+    [
+        (None, "a NoneType"),
+        (1j * np.ones(12), "a ndarray"),
+        ([np.ones(12), 1.0], "a list"),
+        ((np.ones(12),), r"a tuple \(ndarray\)"),
+        ((np.ones(12), 1.0, 2.0), r"a tuple \(ndarray, float, float\)"),
+        ((np.ones(12), "small"), r"a tuple \(ndarray, str\)"),
+        ((np.ones(12), np.ones(1)), r"a tuple \(ndarray, ndarray\)"),
+        ((), r"a tuple \(\)"),
+    ],
+)
+def test_indicators_are_real_numbers(returned: Any, kind: str) -> None:
+    with pytest.raises(TypeError, match=f"the estimator returned {kind}; it must return real indicators, one for each"):
+        run(estimator=lambda u: returned)
+
+
+@pytest.mark.parametrize("marking", [adapt.Marking(), adapt.uniform])
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (
+            np.full(12, np.nan),
+            "the estimator returned nan for cell 0, and 12 such of 12 indicators: they must be finite",
+        ),
+        (np.array([1.0] * 11 + [-0.5]), "the estimator returned -0.5 for cell 11, and 1 such of 12 indicators"),
+        ((np.ones(12), np.inf), "the estimator returned inf as the estimate of the error: it must be finite"),
+    ],
+)
+def test_what_went_wrong_is_in_no_checkpoint(tmp_path: Path, marking: Any, returned: Any, message: str) -> None:
+    """Or no run could go on from there."""
+    with pytest.raises(ValueError, match=message):
+        run(estimator=lambda u: returned, marking=marking, checkpoint=tmp_path / "run.h5")
+    assert not (tmp_path / "run.h5").exists()
 
 
 def test_marking_is_that_of_mark() -> None:
@@ -445,7 +560,10 @@ def test_a_callback_sees_each_step_and_adds_columns(tmp_path: Path) -> None:
         (0.5, TypeError, "the callback returned a float: return None, or numbers by name"),
         ({"dofs": 1.0}, ValueError, "the callback names a number 'dofs', as a column that is there: take another name"),
         ({"rate": 1.0}, ValueError, "the callback names a number 'rate'"),
-        ({"error": "small"}, ValueError, "could not convert string to float: 'small'"),
+        ({"error": "small"}, TypeError, "returned 'small' under the name 'error': return real numbers by name"),
+        ({"error": 1j}, TypeError, "returned 1j under the name 'error'"),
+        ({"errors": [1.0, 2.0]}, TypeError, r"returned \[1.0, 2.0\] under the name 'errors'"),
+        ({1: 2.0}, TypeError, "returned 2.0 under the name 1: return real numbers by name"),
     ],
 )
 def test_what_callbacks_return_is_checked(returned: Any, error: type[Exception], message: str) -> None:

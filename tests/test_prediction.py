@@ -169,6 +169,10 @@ def test_wrong_arguments() -> None:
         adapt.predict(V, eta, order=0)
     with pytest.raises(ValueError, match=r"eta has shape \(3,\)"):
         adapt.predict(V, np.ones(3))
+    with pytest.raises(TypeError, match=r"before is of type FunctionSpace: give what predict has returned, or None"):
+        adapt.predict(V, eta, V)  # type: ignore[arg-type]  # the wrong argument
+    with pytest.raises(TypeError, match=r"prediction needs a space from .*, got ControlMesh"):
+        adapt.predict(V.mesh, eta)  # type: ignore[arg-type]  # the wrong argument
     with pytest.raises(ValueError, match=r"which .* does not refine: give None"):
         adapt.predict(V, eta, before=adapt.predict(space("refined wheel"), np.ones(space("refined wheel").num_cells)))
     with pytest.raises(ValueError, match=r"reduction is 1.0; it must lie between 0 and 1"):

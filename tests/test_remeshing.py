@@ -14,7 +14,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from problems import randomly_refined
-from refinements import CHOICES, MESHES, bernstein_mass, bernstein_rows, chosen, scaled_eigenvalue
+from refinements import CHOICES, MESHES, bernstein_mass, bernstein_rows, chosen, levels_on_cells, scaled_eigenvalue
 
 import ufl
 from thccs_fem import adapt, fem, generators
@@ -81,16 +81,6 @@ def taken_by(hierarchy: Hierarchy, dof: int) -> tuple[int, npt.NDArray[np.int64]
     return l, stage.level.keys[faces]
 
 
-def levels_on_cells(cells: Cells) -> npt.NDArray[np.int64]:
-    """How many levels lie between that of a cell and the coarsest of a function on it, both counted, (num_cells,)."""
-    level_of_dof = np.repeat(np.arange(cells.hierarchy.num_levels), np.diff(cells.hierarchy.dof_offsets))
-    coarsest = np.zeros(cells.num_cells, dtype=int)
-    for batch in cells.batches:
-        levels = np.where(batch.dofs >= 0, level_of_dof[batch.dofs], cells.hierarchy.num_levels)
-        coarsest[batch.cells] = levels.min(axis=1)
-    return cells.level - coarsest + 1
-
-
 # ---- Any sequence of refining and coarsening
 
 
@@ -146,10 +136,12 @@ class Remeshing(RuleBasedStateMachine):
         before, dofs = self.hierarchy, self.functions(choices)
         after = before.remeshed(dofs, self.marked(seed, share))
         assert before.refined(dofs).is_refinement_of(after)
-        if before.rule == "crease":
-            for dof in dofs:
-                l, taken = taken_by(before, dof)
-                assert np.isin(taken, after.refined_keys[l]).all()
+        taken = [taken_by(before, dof) for dof in dofs if before.rule == "crease"]
+        if before.unit == "support":  # those of traces as well
+            supports = zip(before.stages, before.support(dofs), strict=False)
+            taken += [(l, stage.level.keys[support]) for l, (stage, support) in enumerate(supports) if support.any()]
+        for l, keys in taken:
+            assert np.isin(keys, after.refined_keys[l]).all()
         self.hierarchy = after
 
     @invariant()

@@ -162,6 +162,8 @@ def test_other_value_shapes_are_refused(shape: object) -> None:
 
 
 def test_caps_need_a_cut() -> None:
+    with pytest.raises(TypeError, match=r"cap_level is 4.5; it must be an integer"):
+        fem.functionspace(generators.rectangle((2, 2)), ("THCCS", 3), cap_level=4.5)  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="cap_level is 0"):
         fem.functionspace(generators.torus((4, 4)), SCALAR, cap_level=0)
 

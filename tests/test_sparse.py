@@ -21,6 +21,8 @@ from thccs_fem.sparse import (
     rows_of,
     stacked,
     summed,
+    transposed,
+    without_rounding,
 )
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -106,6 +108,23 @@ def test_absolute_sums(seed, shape):
     _, a = random(seed, shape, 40)
     for found, axis in zip(absolute_sums(a), (1, 0), strict=True):
         np.testing.assert_allclose(found, np.abs(a.toarray()).sum(axis=axis), rtol=0, atol=ROUNDING)
+
+
+@given(seed=SEEDS, shape=st.tuples(st.integers(0, 9), st.integers(0, 9)))
+def test_transposed(seed, shape):
+    triplets, expected = random(seed, shape, 40)
+    check(transposed(summed(triplets, shape)), sp.csr_array(expected.T))
+
+
+@given(seed=SEEDS, shape=st.tuples(st.integers(0, 9), st.integers(1, 9)), tolerance=st.sampled_from([0.0, 0.5, 9.0]))
+def test_without_rounding(seed, shape, tolerance):
+    triplets, expected = random(seed, shape, 40)
+    a = summed(triplets, shape)
+    found = without_rounding(a, tolerance)
+    check(found, sp.csr_array(np.where(np.abs(a.toarray()) >= tolerance, a.toarray(), 0.0)))
+    assert (np.abs(found.data) >= tolerance).all()
+    assert a.nnz >= found.nnz  # and a is as it was
+    np.testing.assert_allclose(a.toarray(), expected.toarray(), rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("columns", [1, 40, 4000])

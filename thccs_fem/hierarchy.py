@@ -147,6 +147,7 @@ class Hierarchy:
         A mesh with polygons other than quads, or one whose level-0 functions are dependent, is subdivided once.
 
         Raises:
+            TypeError: If cap_level or admissibility is no integer.
             ValueError: If an option is out of range, or the keys are not those of an admissible hierarchy of the class.
         """
         _check_cap_level(cap_level)
@@ -450,11 +451,15 @@ def _same_keys(keys: Sequence[Keys], others: Sequence[Keys]) -> bool:
 
 
 def _check_cap_level(cap_level: int) -> None:
+    if not isinstance(cap_level, int | np.integer):
+        raise TypeError(f"cap_level is {cap_level!r}; it must be an integer")
     if cap_level < 1:
         raise ValueError(f"cap_level is {cap_level}; a cap needs at least one cut: give 1 or more")
 
 
 def _check_admissibility(admissibility: int | None) -> None:
+    if admissibility is not None and not isinstance(admissibility, int | np.integer):
+        raise TypeError(f"admissibility is {admissibility!r}; it must be an integer of 2 or more, or None")
     if admissibility is not None and admissibility < 2:
         raise ValueError(
             f"admissibility is {admissibility}; where refinement ends two levels meet: give 2 or more, or None for any "

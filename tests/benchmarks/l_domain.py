@@ -5,41 +5,50 @@
 Laplace's equation with the solution r^(2/3) sin(2 theta/3 - pi/3), whose gradient is infinite at the reentrant corner.
 All runs solve, mark by Doerfler's rule with the exact L2 error of each cell, and refine, until the error norm is at
 most the tolerance; all use MUMPS, and Gauss rules of degree 11 for the error. CPU time of one thread, the least of
-several runs, forms compiled before, from the first mesh to the last error; the table says where it went.
+several runs in turns, forms compiled before, from the first mesh to the last error; the table says where it went.
 
 Ours begins with three squares of 4 x 4 faces and marks 0.7 of the error, which takes the least time; caps at level 16
-are a graded quadrature at the corner, with which 0.5 needs the fewest dofs. DOLFINx begins
-with triangles, three squares of 2 x 2 cut in two (about as many dofs), bisects the edges of marked ones, and
-interpolates the boundary values. It marks 0.3 of the error, which is the best for it: with half of it, triangles far
-from the corner are refined for an error that comes from there, and it takes 27000 dofs to 1e-6 in place of 5000.
+are a graded quadrature at the corner, with which 0.5 needs the fewest dofs. "Predicted" refines by several levels at
+once, by the residual and the rates at which it fell before (`adapt.predict`), and looks at the error to stop, alone.
+DOLFINx begins with triangles, three squares of 2 x 2 cut in two (about as many dofs), bisects the edges of marked ones,
+and interpolates the boundary values. It marks 0.3 of the error, which is the best for it: with half of it, triangles
+far from the corner are refined for an error that comes from there, and it takes 27000 dofs to 1e-6 in place of 5000.
+With 0.4, or 4 x 4 squares to begin with, its times differ by no more than those of two runs.
 
-CPU seconds on two slow cores, refinement with cells and operators in it:
+CPU seconds on two slow cores that others used, too; refinement with cells and operators in it:
 
 | L2 error | run | steps | dofs | solve | estimate | refine | together |
 |---|---|---|---|---|---|---|---|
-| 2.5e-6 | ours | 10 | 1041 | 0.20 | 0.03 | 0.11 | 0.35 |
-| 2.5e-6 | ours, 0.5 marked, caps at level 16 | 14 | 852 | 0.33 | 0.06 | 0.21 | 0.61 |
-| 2.5e-6 | DOLFINx P3 | 11 | 3094 | 0.11 | 0.03 | 0.02 | 0.15 |
-| 6.7e-8 | ours | 14 | 4655 | 0.46 | 0.08 | 0.20 | 0.75 |
-| 6.7e-8 | DOLFINx P3 | 18 | 20770 | 0.54 | 0.06 | 0.04 | 0.65 |
+| 2.5e-6 | ours, predicted | 4 | 1048 | 0.06 | 0.03 | 0.07 | 0.16 |
+| 2.5e-6 | ours | 10 | 1041 | 0.13 | 0.03 | 0.11 | 0.28 |
+| 2.5e-6 | ours, 0.5 marked, caps at level 16 | 14 | 852 | 0.19 | 0.04 | 0.18 | 0.42 |
+| 2.5e-6 | DOLFINx P3 | 11 | 3094 | 0.11 | 0.03 | 0.02 | 0.16 |
+| 6.7e-8 | ours, predicted | 6 | 4206 | 0.16 | 0.07 | 0.16 | 0.38 |
+| 6.7e-8 | ours | 14 | 4655 | 0.30 | 0.07 | 0.20 | 0.58 |
+| 6.7e-8 | ours, 0.5 marked, caps at level 16 | 21 | 2628 | 0.45 | 0.11 | 0.37 | 0.95 |
+| 6.7e-8 | DOLFINx P3 | 18 | 20770 | 0.68 | 0.09 | 0.04 | 0.81 |
 
-Where a step of ours goes on the way to 2.5e-6, in ms of 34 (up to 1041 dofs, so most is what every step costs):
+Where a step goes on the way to 2.5e-6, in ms. One level a step: 26 (34 before compiled forms were kept by signature and
+conditions fitted without SciPy's matrices); predicted: 35 for each of 5 solutions. Most is what every step costs.
 
-    19.5  solve                 6.6 dirichletbc, 5.6 assembly and MUMPS, 5.0 LinearProblem(...), 1.4 boundary_dofs
-     4.7    of it jit._compiled_by_ffcx, by UFL's signatures; 1.4 linear.drops_constants
-     4.5  extraction.extract    2.5 _pieces, 0.9 _batches, 0.3 hierarchy._coefficients
-     4.3  adapt.refine          2.8 hierarchy._with_functions: S_l, traces and marks of the levels that change
-     3.3  estimate.error
-     2.3  functionspace         once, 25 ms; 18 of them folds.check_no_folds
-     0.6  adapt.mark
+    one level   predicted
+    12.4        13.4    solve                6.3 (7.5) assembly and MUMPS, 2.8 dirichletbc, 1.6 LinearProblem(...)
+     0.5         0.8      of it forms._compiled, by UFL's signatures; 0.6 jit.compile_expression
+     4.3         7.1    hierarchy._stages    2.2 (2.5) hierarchy._steps: S_l, 0.9 (1.9) levels
+     4.1         4.4    extraction.extract   2.4 _pieces, 1.0 _batches, 0.3 hierarchy._coefficients
+     2.9         3.1    estimate.error       half of it in kernels
+       -         2.4    estimate.residual
+     1.3         3.1    functionspace        once, 15 ms; 8 of them folds.check_no_folds
+     0.6         1.1    adapt.mark, prediction._marked
 
-A refinement costs what it changes. In ms, a step (refinement, then cells with operators) on the L-domain:
+A refinement costs what it changes; cells with operators are made as a whole. In ms, a step (refinement, then cells) on
+the L-domain:
 
-| levels | at the corner alone | on every level | before stages were shared and levels joined |
-|---|---|---|---|
-| 4 | 3 + 4 | 5 + 4 | 15 + 13 |
-| 8 | 5 + 6 | 8 + 7 | 29 + 22 |
-| 16 | 6 + 9 | 13 + 10 | 53 + 38 |
+| levels | at the corner alone | on every level |
+|---|---|---|
+| 4 | 4 + 6 | 6 + 5 |
+| 8 | 4 + 6 | 8 + 9 |
+| 16 | 7 + 9 | 19 + 15 |
 """
 
 import os

@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from problems import singular
+from refinements import levels_on_cells, most_functions
 from scipy.sparse.linalg import eigsh
 
 import ufl
@@ -155,7 +156,6 @@ def dofs_at(rows: Floats, tolerance: float) -> str:
 
 
 def shape(problem: Problem, V: FunctionSpace) -> str:
-    most = max(int((batch.dofs >= 0).sum(axis=1).max()) for batch in V.cells.batches)
     A = fem.assemble_matrix(fem.form(problem.forms(V)[0]))
     entries = np.diff(A.indptr)
     free = np.setdiff1d(np.arange(V.num_dofs), fem.boundary_dofs(V))
@@ -164,8 +164,8 @@ def shape(problem: Problem, V: FunctionSpace) -> str:
     K = sp.csc_matrix(scaled @ inner_part @ scaled)
     largest, smallest = (eigsh(K, 1, sigma=sigma, which="LM", v0=np.ones(free.size))[0][0] for sigma in (None, 0.0))
     return (
-        f"{most} | {entries.mean():.0f}, {entries.max()} | {largest / smallest:.1e} | {iterations(problem, V)} | "
-        f"{levels_on_cells(V)}"
+        f"{most_functions(V.cells)} | {entries.mean():.0f}, {entries.max()} | {largest / smallest:.1e} | "
+        f"{iterations(problem, V)} | {levels_on_cells(V.cells).max()}"
     )
 
 
@@ -174,14 +174,6 @@ def iterations(problem: Problem, V: FunctionSpace) -> int:
     multigrid(made.solver, V)
     made.solve()
     return int(made.solver.getIterationNumber())
-
-
-def levels_on_cells(V: FunctionSpace) -> int:
-    level = np.repeat(np.arange(V.num_levels), np.diff(V.hierarchy.dof_offsets))
-    return max(
-        int((V.cells.level[batch.cells] - np.where(batch.dofs >= 0, level[batch.dofs], 99).min(axis=1)).max()) + 1
-        for batch in V.cells.batches
-    )
 
 
 # ---- A picture -------------------------------------------------------------------------------------------------------

@@ -28,7 +28,7 @@ FITTED = 3  # levels of uniform refinement
 TOLERANCE = 0.2  # of its rates in the size of cells: what terms of higher order still change on these levels
 MARGIN = 1.1  # of errors that were measured
 RESOLVED = 200  # dofs; on coarser meshes nothing is
-SCATTER = np.array([0.2, 0.1])  # of rates that are fitted to the steps of a run
+SCATTER = np.array([0.2, 0.1])  # of rates that are fitted to the steps of a run on a closed surface: 1.84 and 1.45
 VALENCES = [3, 5, 6, 8, 12]
 
 
@@ -100,14 +100,16 @@ def test_adaptive_refinement_is_optimal(graded: tuple[Problem, Floats], estimato
         callback=lambda step, uh: found.append((step.dofs, *errors(uh, problem.exact))),
     )
     adaptive = np.array(found)
-    assert (rates(adaptive[adaptive[:, 0] > RESOLVED]) > OPTIMAL - SCATTER).all()
+    least = OPTIMAL if isinstance(problem, Plane) else OPTIMAL - SCATTER
+    assert (rates(adaptive[adaptive[:, 0] > RESOLVED]) > least).all()
     errors_of_one_dof = [(rows[:, 1:] * rows[:, :1] ** OPTIMAL)[-1] for rows in (adaptive, table)]
     more = np.divide(*errors_of_one_dof)
     assert (more > 0.5).all()  # the marks know the solution, the grading does not
     assert (more < [4.0, 2.2]).all()  # 3.5 and 1.9 were measured: where to refine for H1 is not where to for L2
 
 
-@pytest.mark.parametrize(("valence", "driver"), [(5, "L2"), (8, "H1")])
+@pytest.mark.parametrize("driver", ["L2", "H1"])
+@pytest.mark.parametrize("valence", [5, 8])
 def test_refinement_by_the_exact_error_is_optimal(valence: int, driver: Literal["L2", "H1"]) -> None:
     problem = plane(valence)
     found: list[tuple[float, ...]] = []

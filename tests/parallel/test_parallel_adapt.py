@@ -172,6 +172,3 @@ def test_what_one_rank_gets_wrong_is_refused_by_all(comm: MPI.Comm) -> None:
     for call, error, message in cases:
         with pytest.raises(error, match=f"rank {comm.size - 1} of {comm.size}: .*{message}"):
             call()
-
-
-# ---- Runs

@@ -234,6 +234,39 @@ def test_what_fails_on_one_rank_fails_on_all(comm: MPI.Comm) -> None:
         )
 
 
+def test_estimates_are_those_of_the_whole(comm: MPI.Comm) -> None:
+    """Or ranks would end at different steps, and those that go on would wait for ever."""
+    V = fem.functionspace(generators.torus((6, 6), comm=comm), ("THCCS", 3))
+
+    def part(u: fem.Function) -> tuple[Floats, float]:
+        eta = np.ones(u.function_space.cells.num_owned)
+        return eta, float(comm.rank + 1)
+
+    def run(estimator: Any, stop: Any) -> adapt.History:
+        return adapt.solve(V, lambda V: fem.Function(V), estimator, stop=stop, progress=False)
+
+    with pytest.raises(
+        ValueError, match=rf"returned the estimate 1.0 on one rank, {comm.size}.0 on another: each must"
+    ):
+        run(part, adapt.Stop(tolerance=1.0))
+
+    history = run(lambda u: (part(u)[0], 1.0 + 1e-12 * comm.rank), adapt.Stop(tolerance=1.0))  # rounding
+    assert (len(history.steps), history["estimate"][0]) == (1, 1.0)
+
+
+def test_the_first_rank_knows_when_to_end(comm: MPI.Comm) -> None:
+    """Rules of users may look at a clock, or at a number of the rank."""
+    V = fem.functionspace(generators.torus((6, 6), comm=comm), ("THCCS", 3))
+    history = adapt.solve(
+        V,
+        lambda V: fem.Function(V),
+        lambda u: np.ones(u.function_space.cells.num_owned),
+        stop=lambda history: f"rank {comm.rank}" if len(history.steps) > 1 + comm.rank else None,
+        progress=False,
+    )
+    assert (len(history.steps), history.reason) == (2, "rank 0")
+
+
 def test_curves_are_written_by_the_first_rank(comm: MPI.Comm, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     V = fem.functionspace(generators.torus((6, 6), comm=comm), ("THCCS", 3))
     history = adapt.solve(

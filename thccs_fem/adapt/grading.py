@@ -56,10 +56,12 @@ def grade_extraordinary(V: FunctionSpace, levels: int, *, subdivided: int = 0) -
 
     Raises:
         ValueError: If a number is negative.
-        TypeError: If V is no space of splines.
+        TypeError: If V is no space of splines, or a number no integer.
     """
     check_space(V, "grading")
     for name, number in (("levels", levels), ("subdivided", subdivided)):
+        if not isinstance(number, int | np.integer):
+            raise TypeError(f"{name} is {number!r}: expected an integer")
         if number < 0:
             raise ValueError(f"{name} is {number}: expected 0 or more")
     for l in range(levels):

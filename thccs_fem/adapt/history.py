@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -68,7 +69,7 @@ class Stop:
 
     Raises:
         ValueError: Nothing is given, or a value is out of range.
-        TypeError: A count is no integer.
+        TypeError: A count is no integer, or another value no number.
     """
 
     tolerance: float = 0.0
@@ -84,6 +85,10 @@ class Stop:
                 raise TypeError(f"{name} is {count!r}; it must be an integer")
             if count is not None and count < least:
                 raise ValueError(f"{name} is {count}; it must be at least {least}")
+        for name in ("tolerance", "seconds"):
+            value = getattr(self, name)
+            if not isinstance(value, Real) and not (name == "seconds" and value is None):
+                raise TypeError(f"{name} is {value!r}; it must be a number")
         if not (np.isfinite(self.tolerance) and self.tolerance >= 0.0):
             raise ValueError(f"tolerance is {self.tolerance}; it must be finite and not negative")
         if self.seconds is not None and not self.seconds > 0.0:

@@ -18,13 +18,22 @@ from thccs_fem.adapt.remeshing import refine
 from thccs_fem.adapt.resuming import Solution, begun, listed, resumed, save
 from thccs_fem.adapt.transfer import transfer
 from thccs_fem.fem.function import Function
-from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.parallel import by_first_rank, largest, rank_of, together
+from thccs_fem.fem.space import FunctionSpace, check_space
+from thccs_fem.parallel import by_first_rank, largest, rank_of, smallest, together
 from thccs_fem.partition import partition
 
 __all__ = ["Problem", "solve"]
 
 Floats = npt.NDArray[np.float64]
+
+SAME = 1e-6  # relative difference of the estimates on the ranks that may be rounding
+CALLED = {  # what arguments are functions of, and what does for one
+    "problem": "the space, such as lambda V: LinearProblem(...) with forms in V",
+    "estimator": "the solution, such as lambda uh: estimate.bubble(uh, a, L)",
+    "marking": 'the space and the indicators, such as adapt.Marking("dorfler", 0.5)',
+    "stop": "the history, such as adapt.Stop(tolerance=1e-3, dofs=10_000)",
+    "callback": "the step and the solution",
+}
 
 
 class Problem(Protocol):
@@ -79,14 +88,19 @@ def solve(
         The history with the last solution.
 
     Raises:
-        TypeError: If the problem is neither a problem nor a solution, or the callback returns no numbers by name.
+        TypeError: If V is no space, or another argument no function; the problem is neither a problem nor a solution,
+            or the indicators are no numbers; or `stop` returns no text, or the callback no numbers by name.
         ValueError: If the checkpoint is of another loop, space or mesh, or none that `checkpoint.read` can read; or the
-            solution is in another space than the problem was made for; or a name from the callback is taken.
+            solution is in another space than the problem was made for, or has other unknowns than that before; or
+            indicators are not one a cell, negative or not finite; or ranks have different estimates; or a name from the
+            callback is taken.
     """
     from tqdm import tqdm
 
+    check_space(V, "adapt.solve")
+    _check_called(problem=problem, estimator=estimator, marking=marking, stop=stop, callback=callback)
     run = begun(V) if checkpoint is None else resumed(checkpoint, V)
-    V, reason = run.V, stop(run.history) if run.history.steps else None
+    V, reason = run.V, _reason(run.V, stop(run.history)) if run.history.steps else None
     most = getattr(stop, "steps", None)
     with tqdm(
         total=None if most is None else most + 1,
@@ -110,7 +124,7 @@ def solve(
             run = replace(run, V=V, history=History((*run.history.steps, step), u), eta=eta)
             if checkpoint is not None:
                 save(checkpoint, run)
-            reason = stop(run.history)
+            reason = _reason(V, stop(run.history))
             bar.set_postfix(dofs=step.dofs, estimate=f"{abs(total):.2e}")
             bar.update()
     return replace(run.history, reason=reason)
@@ -121,7 +135,13 @@ def _step(V: FunctionSpace, u: Solution, number: int, total: float, seconds: flo
     return Step(number, V.num_levels, V.num_cells, dofs, total, seconds, partition(V.hierarchy).imbalance)
 
 
-# ---- What the user's functions return --------------------------------------------------------------------------------
+# ---- The user's functions, and what they return ----------------------------------------------------------------------
+
+
+def _check_called(**given: object) -> None:
+    for name, value in given.items():
+        if not callable(value) and not (name == "callback" and value is None):
+            raise TypeError(f"{name} is of type {type(value).__name__}: give a function of {CALLED[name]}")
 
 
 def _is_solution(given: object) -> bool:
@@ -142,37 +162,88 @@ def _solution(V: FunctionSpace, posed: Any, last: Any) -> Any:
             _guess(posed.u, last)
         posed.solve()
         posed = posed.u
-    found = listed(posed)[0].function_space
-    if found.hierarchy is not V.hierarchy and not found.hierarchy.same_as(V.hierarchy):
+    spaces = [u.function_space for u in listed(posed)]
+    # Of several unknowns others may be in spaces of their own, such as finer ones for velocities.
+    if not any(_is_in(V, W) for W in spaces):
+        elsewhere = "" if spaces[0].mesh is V.mesh else " on another mesh"
         raise ValueError(
-            f"the problem was called with {V}, but its solution is in {found}: make its forms, conditions and "
-            f"functions anew in the space that it is called with"
+            f"the problem was called with {V}, but its solution is in {spaces[0]}{elsewhere}: make its forms, "
+            f"conditions and functions anew in the space that it is called with"
         )
     return posed
 
 
+def _is_in(V: FunctionSpace, W: object) -> bool:
+    return isinstance(W, FunctionSpace) and (W.hierarchy is V.hierarchy or W.hierarchy.same_as(V.hierarchy))
+
+
 def _guess(u: Solution, last: Solution) -> None:
     """Give the unknowns the values of the last solution."""
+    now, then = ([f.function_space.value_shape for f in listed(each)] for each in (u, last))
+    if now != then:
+        raise ValueError(
+            f"the problem has unknowns with values of shape {now}, the last solution {then}: pose a problem for the "
+            f"same unknowns in each step; if the last one is from the checkpoint of another problem, remove that"
+        )
     for function, before in zip(listed(u), listed(last), strict=True):
         function.x.array = transfer(before, function.function_space).x.array
 
 
 def _estimated(V: FunctionSpace, returned: Any) -> tuple[Floats, float]:
     """Return the indicators and the estimate."""
-    given, value = returned if isinstance(returned, tuple) else (returned, None)
-    num_cells = partition(V.hierarchy).cells.size_local
+    eta, value = together(V.mesh.comm, lambda: _checked(partition(V.hierarchy).cells.size_local, returned))
+    if value is None:
+        return eta, estimate.norm(V, eta)
+    comm = V.mesh.comm
+    least, most = smallest(comm, value), largest(comm, value)
+    if not np.isfinite([least, most]).all():
+        raise ValueError(f"the estimator returned {value} as the estimate of the error: it must be finite")
+    if most - least > SAME * max(abs(least), abs(most)):
+        raise ValueError(
+            f"the estimator returned the estimate {least} on one rank, {most} on another: each must return that of the "
+            f"whole, as V.mesh.comm.allreduce makes it of integrals over parts"
+        )
+    return eta, by_first_rank(comm, lambda: value)
 
-    def checked() -> Floats:
-        eta = np.asarray(given, dtype=np.float64)
-        if eta.shape != (num_cells,):
-            raise ValueError(
-                f"the estimator returned indicators of shape {eta.shape}; it needs one for each of the {num_cells} "
-                f"cells, ({num_cells},), or these and the estimate, (eta, estimate)"
-            )
-        return eta
 
-    eta = together(V.mesh.comm, checked)
-    return eta, estimate.norm(V, eta) if value is None else float(value)
+def _checked(num_cells: int, returned: Any) -> tuple[Floats, float | None]:
+    """Return the indicators and the estimate, None where it is their norm."""
+    wanted = f"one for each of the {num_cells} cells, ({num_cells},), or these and the estimate, (eta, estimate)"
+    parts = returned if isinstance(returned, tuple) else (returned, 0.0)
+    eta, value = (_real(part) for part in parts) if len(parts) == 2 else (None, None)
+    if eta is None or value is None or value.shape:
+        kinds = ", ".join(type(part).__name__ for part in parts)
+        kind = f"a tuple ({kinds})" if parts is returned else f"a {type(returned).__name__}"
+        raise TypeError(f"the estimator returned {kind}; it must return real indicators, {wanted}")
+    if eta.shape != (num_cells,):
+        raise ValueError(f"the estimator returned indicators of shape {eta.shape}; it needs {wanted}")
+    bad = np.flatnonzero(~(np.isfinite(eta) & (eta >= 0.0)))
+    if bad.size:
+        raise ValueError(
+            f"the estimator returned {eta[bad[0]]} for cell {bad[0]}, and {bad.size} such of {num_cells} indicators: "
+            f"they must be finite and not negative; is the solution finite?"
+        )
+    return eta, float(value) if parts is returned else None
+
+
+def _real(given: Any) -> Floats | None:
+    """Return real numbers as an array; None if they are none."""
+    try:
+        array = np.asarray(given)
+    except ValueError:  # of lists of arrays, say
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "biuf" else None
+
+
+def _reason(V: FunctionSpace, returned: object) -> str | None:
+    """Return why the run ends, as rank 0 was told, on all ranks: clocks of others may say something else."""
+
+    def checked() -> str | None:
+        if not isinstance(returned, str | None):
+            raise TypeError(f"stop returned {returned!r}: return text, why the run ends, or None to go on")
+        return returned
+
+    return by_first_rank(V.mesh.comm, checked)
 
 
 def _numbers(V: FunctionSpace, returned: Any) -> Mapping[str, float]:
@@ -181,9 +252,11 @@ def _numbers(V: FunctionSpace, returned: Any) -> Mapping[str, float]:
     def checked() -> dict[str, float]:
         if not isinstance(returned, Mapping | None):
             raise TypeError(f"the callback returned a {type(returned).__name__}: return None, or numbers by name")
-        taken = [name for name in returned or () if name in COLUMNS or name == "rate"]
-        if taken:
-            raise ValueError(f"the callback names a number {taken[0]!r}, as a column that is there: take another name")
+        for name, value in (returned or {}).items():
+            if not isinstance(name, str) or (number := _real(value)) is None or number.shape:
+                raise TypeError(f"the callback returned {value!r} under the name {name!r}: return real numbers by name")
+            if name in COLUMNS or name == "rate":
+                raise ValueError(f"the callback names a number {name!r}, as a column that is there: take another name")
         return {name: float(value) for name, value in (returned or {}).items()}
 
     return by_first_rank(V.mesh.comm, checked)

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from thccs_fem.adapt.marking import TIE, on_all_cells, places
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.space import FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.sparse import csr, entries, product, rows_of, transposed
 from thccs_fem.subdivision import Ints
@@ -91,9 +91,13 @@ def predict(
             never larger.
 
     Raises:
+        TypeError: If V is no space of splines, or `before` no prediction.
         ValueError: If eta does not fit the cells or is negative or not finite, or the order is not positive, or V is
             no refinement of the space before.
     """
+    check_space(V, "prediction")
+    if not isinstance(before, Prediction | None):
+        raise TypeError(f"before is of type {type(before).__name__}: give what predict has returned, or None")
     if not order > LEAST_RATE:
         raise ValueError(f"order is {order}; give the order of convergence for smooth solutions, 3 in H1, 4 in L2")
     of_cells = on_all_cells(V, eta)

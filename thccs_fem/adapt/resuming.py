@@ -81,7 +81,8 @@ def resumed(path: str | os.PathLike[str], V: FunctionSpace) -> Run:
     unknowns = [saved.functions[name] for name in stored]
     indicators = saved.functions[f"indicators of {stored[0]}"]
     found = indicators.function_space.hierarchy
-    if run["began with"] != V.num_dofs or not found.is_refinement_of(V.hierarchy):
+    kept = (found.unit, found.admissibility) == (V.hierarchy.unit, V.hierarchy.admissibility)
+    if run["began with"] != V.num_dofs or not (kept and found.is_refinement_of(V.hierarchy)):
         raise ValueError(
             f"{path} is of a run that began with {run['began with']} dofs in another space than {V}: begin with the "
             f"same, or give another name, or remove the file to begin anew"

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
+from thccs_fem.estimate.indicators import check_function
 from thccs_fem.fem.assembly import bubble_energies
 from thccs_fem.fem.forms import Form, form
 from thccs_fem.fem.function import Function
@@ -47,9 +48,11 @@ def bubble(uh: Function, a: ufl.Form | Form, L: ufl.Form | Form | None = None) -
         Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
+        TypeError: If uh is no function.
         ValueError: If forms and uh have different spaces or functions on finer cells; F does not depend on uh; or the
             local problem of a cell has no solution.
     """
+    check_function(uh)
     V = uh.function_space
     bilinear, linear = _linearised(uh, a) if L is None else (form(a), form(L))
     _check_problem(V, bilinear, linear)

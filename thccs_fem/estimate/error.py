@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
-from thccs_fem.estimate.indicators import over_cells
+from thccs_fem.estimate.indicators import check_function, over_cells
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 
@@ -21,27 +21,30 @@ Expr = ufl.core.expr.Expr
 
 def error(
     uh: Function,
-    u_exact: Expr | Callable[[ufl.SpatialCoordinate], Expr],
+    u_exact: Expr | float | Callable[[ufl.SpatialCoordinate], Expr | float],
     norm: Literal["L2", "H1"] = "L2",
 ) -> Floats:
     """Return the norm of the error on each cell.
 
     Args:
         uh: The approximation.
-        u_exact: The exact solution: a UFL expression, or a function that makes one of the spatial coordinate.
+        u_exact: The exact solution: a UFL expression or a number, or a function that makes one of the spatial
+            coordinate.
         norm: "L2", or "H1" (the full norm: values and gradients along the surface).
 
     Returns:
         Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
+        TypeError: If uh is no function.
         ValueError: If the norm is unknown.
     """
+    check_function(uh)
     V = uh.function_space
     if norm not in ("L2", "H1"):
         raise ValueError(f'norm is {norm!r}; it must be "L2" or "H1"')
-    exact = u_exact if isinstance(u_exact, Expr) else u_exact(ufl.SpatialCoordinate(V.mesh))
-    e = uh - exact
+    exact = u_exact if isinstance(u_exact, Expr | float | int) else u_exact(ufl.SpatialCoordinate(V.mesh))
+    e = uh - ufl.as_ufl(exact)
     density = ufl.inner(e, e)
     if norm == "H1":
         gradient = _tangential(V, ufl.grad(e))

@@ -51,6 +51,7 @@ Floats = npt.NDArray[np.float64]
 Fixed = Callable[[FunctionSpace], npt.ArrayLike | DirichletBC | Sequence[DirichletBC]]
 
 MEAN = 1e-3  # of a function, relative to that of absolute values of coefficients; quadrature leaves 1e-6
+FREE = 1e-10  # coefficient of a function that is more than rounding
 HINTS = {
     "F": "it is the residual that uh solves, of linear problems a(uh, v) - L(v)",
     "J": "it is a number computed from uh, such as uh * dx(1)",
@@ -102,9 +103,9 @@ def goal(
         Indicators, shape (cells.num_owned,), those of the cells that this rank owns, and the estimate of J(u) - J(uh).
 
     Raises:
-        TypeError: If uh is no function, F or J no UFL form, or `fixed` no function of a space.
+        TypeError: If uh is no function, F or J no UFL form, or `fixed` no function of a space, or it returns None.
         ValueError: If F has not just one argument, of the space of uh, or J has any; or one of them does not depend on
-            uh; or constants are free, and uh has not mean zero.
+            uh; or constants are free, and uh has not mean zero; or `fixed` does not look at the space.
     """
     V = _checked_space(uh, F, J, fixed)
     W = _refined_everywhere(V)
@@ -112,18 +113,19 @@ def goal(
     given = coarse = _Equations(F, J, uh, V)
     fine = middle = given.at(_carried(P, uh, W), W)
     (dofs, jump), (coarse_dofs, _) = _prescribed(fine.u, fixed), _prescribed(uh, fixed)
+    _check_found_anew(P, V, W, coarse_dofs, dofs)
     fine.check_means(dofs)
+    residual, change_of_goal = fine.residual(), fine.goal() - given.goal()
     if not fine.is_linear:
         halfway = _plus(fine.u, fine.newton_step(dofs, jump, problem) / 2.0)
         middle, coarse = fine.at(halfway, W), fine.at(halfway, V)
     z, z_h = middle.dual(dofs, problem), coarse.dual(coarse_dofs, problem)
-    residual = fine.residual()
     shares = P.transposed(_by_functions(-(z.x.array - _carried(P, z_h, W).x.array) * residual, W))
     V.index_map.scatter_forward(shares)
     change = middle.balance(dofs) * fine.u.x.array - z.x.array * residual
     if total(V.mesh.comm, int(jump.any())):
         change[dofs] += jump * middle.sensitivity(z)[dofs]
-    value = fine.goal() - given.goal() + total(V.mesh.comm, float(np.sum(change[: W.num_owned_dofs])))
+    value = change_of_goal + total(V.mesh.comm, float(np.sum(change[: W.num_owned_dofs])))
     return np.sqrt(_over_supports(V, np.abs(shares))), value
 
 
@@ -289,12 +291,31 @@ def _prescribed(u: Function, fixed: Fixed | None) -> tuple[Ints, Floats]:
     """
     V = u.function_space
     given: Any = [] if fixed is None else fixed(V)
+    if given is None:
+        raise TypeError("fixed returned None: let it return what is prescribed in the space that it is called with")
     listed: Any = [given] if isinstance(given, DirichletBC) else given
     if isinstance(listed, Sequence) and all(isinstance(bc, DirichletBC) for bc in listed):
         dofs, values = constraints(listed, V)
         return dofs, values - u.x.array[dofs]
     dofs, _ = constraints([dirichletbc(0.0, listed, V)], V)
     return dofs, np.zeros(dofs.size)
+
+
+def _check_found_anew(P: Prolongation, V: FunctionSpace, W: FunctionSpace, coarse_dofs: Ints, dofs: Ints) -> None:
+    """Raise if dofs that were found for V are taken for those of W: others than functions free in V need.
+
+    Raises:
+        ValueError: The numbers are the same, but functions that are free in V have some of the prescribed dofs in W.
+    """
+    free = np.ones((V.num_local_dofs // V.block_size, V.block_size))
+    free.ravel()[coarse_dofs] = 0.0
+    comm, others = V.mesh.comm, int(not np.array_equal(coarse_dofs, dofs))
+    touched = np.count_nonzero(P(free).ravel()[dofs] > FREE)
+    if not total(comm, others) and total(comm, touched):
+        raise ValueError(
+            f"fixed returned the same dofs for {V} and for {W}, but they are others there: let it find them in the "
+            f"space that it is called with, as fem.boundary_dofs or lambda W: fem.boundary_dofs(W) do"
+        )
 
 
 def _derivative(name: str, what: ufl.Form, u: Function, direction: ufl.Argument) -> ufl.Form:

@@ -8,10 +8,11 @@ import numpy.typing as npt
 import ufl
 from thccs_fem.fem.assembly import assemble_cells
 from thccs_fem.fem.forms import form
+from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace
 from thccs_fem.parallel import total
 
-__all__ = ["norm", "over_cells"]
+__all__ = ["check_function", "norm", "over_cells"]
 
 Floats = npt.NDArray[np.float64]
 QUADRATURE_DEGREE = 11  # 6 x 6 Gauss points: the error is no polynomial
@@ -20,6 +21,19 @@ QUADRATURE_DEGREE = 11  # 6 x 6 Gauss points: the error is no polynomial
 def norm(V: FunctionSpace, eta: Floats) -> float:
     """Return the root of the sum of the squared indicators, over all ranks; collective."""
     return float(np.sqrt(total(V.mesh.comm, np.sum(np.asarray(eta) ** 2))))
+
+
+def check_function(uh: object) -> None:
+    """Raise if the approximation is none.
+
+    Raises:
+        TypeError: It is no function.
+    """
+    if not isinstance(uh, Function):
+        several = " Of several unknowns give one at a time, and add their squares: np.hypot(eta_u, eta_p)"
+        raise TypeError(
+            f"uh is of type {type(uh).__name__}; it must be a fem.Function.{several * isinstance(uh, list | tuple)}"
+        )
 
 
 def over_cells(V: FunctionSpace, integrals: ufl.Form) -> Floats:

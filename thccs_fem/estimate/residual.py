@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 import ufl
-from thccs_fem.estimate.indicators import over_cells
+from thccs_fem.estimate.indicators import check_function, over_cells
 from thccs_fem.fem.function import Function, cell_sizes
 from thccs_fem.fem.space import FunctionSpace
 
@@ -108,13 +108,16 @@ def residual(
         Shape (cells.num_owned,), those of the cells that this rank owns.
 
     Raises:
+        TypeError: If uh is no function, or the strong residual no expression.
         ValueError: If an expression has functions on finer cells, an edge tag is unknown, the order is neither 2 nor 4,
-            or there are moments at order 2.
+            or there are moments at order 2, or stiffness or reaction is a number out of range.
     """
     if order not in _OF_ORDER:
         raise ValueError(f"order is {order!r}; residuals of equations of order 2 and 4 are known")
     if order == 2 and not (moment is None and moments is None):
         raise ValueError("moment or moments are given, but the order is 2: of plates and shells it is order=4")
+    check_function(uh)
+    _check_values(strong_residual, stiffness, reaction)
     V, weights = uh.function_space, _OF_ORDER[order]
     n = ufl.FacetNormal(V.mesh.ufl_domain())
     terms = [(strong_residual, weights.strong, order, ufl.dx)]
@@ -132,6 +135,16 @@ def residual(
         weight = 1 / (k / (factor * h**power) + k * (c / k) ** (power / order))
         integrals += weight * ufl.inner(value, value) * over(domain=V.mesh.ufl_domain())
     return np.sqrt(np.maximum(over_cells(V, integrals), 0.0))
+
+
+def _check_values(strong_residual: object, stiffness: object, reaction: object) -> None:
+    if not isinstance(strong_residual, Expr | float | int):
+        kind = type(strong_residual).__name__
+        raise TypeError(f"the strong residual is of type {kind}: give an expression, such as f + div(grad(uh))")
+    if isinstance(stiffness, float | int) and not stiffness > 0.0:
+        raise ValueError(f"stiffness is {stiffness}; it must be positive, as squares are divided by it")
+    if isinstance(reaction, float | int) and not reaction >= 0.0:
+        raise ValueError(f"reaction is {reaction}; it must not be negative: leave out what is not coercive")
 
 
 def _on_boundary(conditions: Conditions) -> Iterator[tuple[Expr, ufl.Measure]]:

@@ -403,7 +403,7 @@ def functionspace(
             faces at it, which needs fewer dofs and more steps (see docs/adaptivity.md).
 
     Raises:
-        TypeError: If `mesh` is no control mesh.
+        TypeError: If `mesh` is no control mesh, or cap_level or admissibility no integer.
         ValueError: If the element is none of ours, or an option is out of range, or the planar surface folds.
         NotImplementedError: If the mesh has creases inside.
     """
