@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from problems import lifted, singular, uniformly_refined, wavy
+from problems import lifted, singular, tangential, uniformly_refined, wavy
 
 import ufl
 from thccs_fem import adapt, estimate, fem, generators
@@ -85,14 +85,6 @@ def arguments(V: fem.FunctionSpace) -> tuple[ufl.Argument, ufl.Argument]:
 
 def root(density: Expr) -> float:
     return float(np.sqrt(assemble_cells(fem.form(density * dx, quadrature_degree=11)).sum()))
-
-
-def tangential(msh: ControlMesh, gradient: Expr) -> Expr:
-    """Return the tangential part of a gradient of a function of space."""
-    if msh.gdim == 2:
-        return gradient
-    domain = msh.ufl_domain()
-    return dot(gradient, ufl.Jacobian(domain) * ufl.JacobianInverse(domain))
 
 
 # ---- Second order

@@ -69,7 +69,7 @@ class Closed:
         return projected_in_h1(V, self.exact)
 
     def residual(self, uh: fem.Function) -> Floats:
-        f = self.exact - laplacian(uh.function_space, self.exact)
+        f = self.exact - laplacian(uh.function_space.mesh, self.exact)
         return estimate.residual(uh, f - uh + div(grad(uh)))
 
     def bubble(self, uh: fem.Function) -> Floats:

@@ -26,6 +26,7 @@ __all__ = [
     "refined_towards",
     "singular",
     "smooth",
+    "tangential",
     "uniformly_refined",
     "wavy",
 ]
@@ -135,19 +136,17 @@ def singular(x: Expr) -> Expr:
     return (x[0] ** 2 + x[1] ** 2) ** (1 / 3) * ufl.sin(2 * theta / 3 - np.pi / 3)
 
 
-def laplacian(V: fem.FunctionSpace, g: Expr) -> Expr:
-    """Return the Laplace-Beltrami operator of a function of space on a closed surface.
+def tangential(msh: ControlMesh, gradient: Expr) -> Expr:
+    """Return the part of a gradient that is tangential to the surface: UFL's own of a function of space is another."""
+    if msh.gdim == 2:
+        return gradient
+    domain = msh.ufl_domain()
+    return ufl.dot(gradient, ufl.Jacobian(domain) * ufl.JacobianInverse(domain))
 
-    By the chain rule: that of the coordinates, which are functions of any space, is the vector of mean curvature.
-    """
-    coordinates = [fem.Function(V) for _ in range(V.mesh.gdim)]
-    points = [V.hierarchy.points[l][V.hierarchy.dof_functions(l)] for l in range(V.num_levels)]
-    for function, values in zip(coordinates, np.concatenate(points).T, strict=True):
-        function.x.array = values
-    domain = V.mesh.ufl_domain()
-    tangential = ufl.Jacobian(domain) * ufl.JacobianInverse(domain)
-    curvature = ufl.as_vector([ufl.div(grad(x)) for x in coordinates])
-    return inner(grad(grad(g)), tangential) + ufl.dot(grad(g), curvature)
+
+def laplacian(msh: ControlMesh, g: Expr) -> Expr:
+    """Return the Laplace-Beltrami operator of a function of space."""
+    return ufl.div(tangential(msh, grad(g)))
 
 
 # ---- Solvers

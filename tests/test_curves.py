@@ -106,6 +106,45 @@ def test_a_single_step_is_drawn(tmp_path: Path) -> None:
     assert [len(line.get_xydata()) for line in figure.axes[0].lines] == [1]  # and no slopes
 
 
+@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
+def test_the_same_curves_are_the_same_file(ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On any day, and whatever identifiers Matplotlib makes up."""
+    files = [tmp_path / f"{day}.{ending}" for day in (1, 2)]
+    for day, file in enumerate(files):
+        monkeypatch.setenv("SOURCE_DATE_EPOCH", str(86_400 * day))  # the date that Matplotlib takes
+        plot.convergence(falling(1.5), file)
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.usefixtures("unwritten")
+def test_one_slope_may_be_a_number(tmp_path: Path) -> None:
+    one, several, none = (plot.convergence(falling(1.5), tmp_path / "a.png", slopes=s) for s in (1.5, [1.5], ()))
+    np.testing.assert_array_equal(references(one)[0], references(several)[0])
+    assert (len(references(one)), len(references(none))) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("runs", "options", "error", "message"),
+    [
+        ([falling(1.5)], {}, TypeError, 'the run, of type list, has no column "dofs": give a history, or several by n'),
+        ({"a": [1.0]}, {}, TypeError, "the run 'a', of type list, has no column \"dofs\""),
+        ({"a": {"estimate": [1.0]}}, {}, TypeError, "the run 'a', of type dict, has no column \"dofs\""),
+        (
+            {"dofs": [1, 2, 3], "estimate": [2, 1]},
+            {},
+            ValueError,
+            r"the column 'estimate' has shape \(2,\), that of the dofs \(3,\)",
+        ),
+        (falling(1.5), {"columns": []}, ValueError, "there are no columns to draw: give a name or several"),
+    ],
+)
+def test_what_is_no_table_is_refused(
+    runs: Any, options: dict[str, Any], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        plot.convergence(runs, tmp_path / "a.png", **options)
+
+
 def test_curves_that_can_not_be_drawn(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="no run has a column 'eror' with values to draw"):
         plot.convergence(falling(1.5), tmp_path / "a.png", columns=("error", "eror"))

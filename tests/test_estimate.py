@@ -190,8 +190,9 @@ def test_residual_sees_what_is_missing() -> None:
         assert (eta[~whole] ** 2 < by_area[~whole]).all()
 
 
-@pytest.mark.parametrize("valence", [4, 5, 8])
-def test_residual_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
+@pytest.mark.parametrize(("valence", "lower", "upper"), [(4, 0.95, 1.1), (5, 0.45, 1.05), (8, 0.6, 1.4)])
+def test_residual_is_as_large_as_the_error_on_all_levels(valence: int, lower: float, upper: float) -> None:
+    """1.00 to 1.03, 0.53 to 0.94 and 0.66 to 1.29, which rises as elements come to the level of the caps."""
     V = fem.functionspace(generators.wheel(valence, 2), ("THCCS", 3))
     exact = wavy(ufl.SpatialCoordinate(V.mesh))
     effectivities = []
@@ -200,8 +201,7 @@ def test_residual_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
         uh = poisson(V, exact, 6.25 * exact)
         estimated = estimate.norm(V, estimate.residual(uh, 6.25 * exact + div(grad(uh))))
         effectivities.append(estimated / errors(uh, exact)[1])
-    assert 0.5 < min(effectivities)
-    assert max(effectivities) < 1.4  # 1.0 on regular meshes; 0.5 to 0.9, and 0.7 to 1.3 at valences 5 and 8
+    assert lower < min(effectivities) < max(effectivities) < upper
 
 
 def test_residual_of_a_neumann_condition() -> None:
@@ -265,9 +265,11 @@ def test_jumps_at_caps_are_a_small_part() -> None:
     assert 1e-3 < added.sum() / (without**2).sum() < 0.03  # 0.017 where the caps are two levels below the cells
 
 
-@pytest.mark.parametrize("valence", [4, 5])
-def test_residual_with_a_neumann_condition_is_as_large_as_the_error_on_all_levels(valence: int) -> None:
-    """-div(grad(u)) + u = f with grad(u).n = g on the whole boundary."""
+@pytest.mark.parametrize(("valence", "lower", "upper"), [(4, 0.95, 1.1), (5, 0.45, 1.15)])
+def test_residual_with_a_neumann_condition_is_as_large_as_the_error_on_all_levels(
+    valence: int, lower: float, upper: float
+) -> None:
+    """-div(grad(u)) + u = f with grad(u).n = g on the whole boundary: 1.01 to 1.04, and 0.54 to 1.07."""
     V = fem.functionspace(generators.wheel(valence, 2), ("THCCS", 3))
     exact, n = wavy(ufl.SpatialCoordinate(V.mesh)), ufl.FacetNormal(V.mesh)
     f, g = 7.25 * exact, ufl.dot(grad(exact), n)
@@ -279,8 +281,7 @@ def test_residual_with_a_neumann_condition_is_as_large_as_the_error_on_all_level
         uh = LinearProblem(a, L).solve()
         eta = estimate.residual(uh, f + div(grad(uh)) - uh, g - ufl.dot(grad(uh), n), grad(uh))
         effectivities.append(estimate.norm(V, eta) / errors(uh, exact)[1])
-    assert 0.5 < min(effectivities)
-    assert max(effectivities) < 1.3  # 1.0 to 1.1 on regular meshes, 0.6 to 1.1 at valence 5
+    assert lower < min(effectivities) < max(effectivities) < upper
 
 
 def test_terms_of_fourth_order() -> None:

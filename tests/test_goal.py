@@ -342,7 +342,7 @@ def test_dofs_are_found_anew() -> None:
     V = problem.V
     uh = problem.solve(V)
     F, J = problem.forms(uh)
-    with pytest.raises(ValueError, match=r"fixed returned the same dofs for .* and for .*, but they are others there"):
+    with pytest.raises(ValueError, match=r"fixed returned the same dofs for the space of uh and for its refinement"):
         estimate.goal(uh, F, J, fixed=lambda W: fem.boundary_dofs(V))
     with pytest.raises(ValueError, match=r"fixed returned the same dofs"):
         estimate.goal(uh, F, J, fixed=lambda W: fem.dirichletbc(0.0, fem.boundary_dofs(V), W))

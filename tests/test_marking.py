@@ -134,6 +134,12 @@ def test_wrong_arguments_of_mark_are_named(eta: Floats, options: dict, message: 
         adapt.mark(space("grid"), eta, **options)
 
 
+def test_marks_are_those_of_a_space() -> None:
+    for mark in (adapt.mark, adapt.mark_coarsening):
+        with pytest.raises(TypeError, match=r"marking needs a space from fem.functionspace\(.*, got ControlMesh"):
+            mark(space("grid").mesh, np.ones(12))  # type: ignore[operator]  # the wrong argument
+
+
 # ---- Marking for coarsening
 
 

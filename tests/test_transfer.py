@@ -56,6 +56,8 @@ def test_transfer_to_an_unrelated_space_is_refused() -> None:
         adapt.transfer(with_random_values(V), space("grid, crease"))
     with pytest.raises(ValueError, match=r"values of shape \(\) cannot be carried to shape \(2,\)"):
         adapt.transfer(with_random_values(V), fem.FunctionSpace(V.hierarchy, (2,)))
+    with pytest.raises(TypeError, match=r"u is of type list; it must be a fem.Function: of several give one at a time"):
+        adapt.transfer([with_random_values(V)], V)  # type: ignore[arg-type]  # the wrong argument
     with pytest.raises(ValueError, match='projection is \'L1\'; it must be "L2" or "H1"'):
         adapt.transfer(with_random_values(V), V, projection="L1")  # type: ignore[arg-type]
 

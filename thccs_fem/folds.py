@@ -39,8 +39,8 @@ def check_no_folds(cells: Cells) -> None:
     if folded.size:
         raise ValueError(
             f"the planar surface folds (det J <= 0) on {folded.size} of {mesh.num_faces} faces, first "
-            f"{folded[:SHOWN].tolist()}: "
-            f"move the vertices of these faces until neighbouring edges no longer cross, or subdivide them more evenly"
+            f"{folded[:SHOWN].tolist()}: move the vertices of these faces until neighbouring edges no longer cross, or "
+            f"subdivide them more evenly"
         )
     _check_tagged_corners(cells)
 
@@ -107,8 +107,6 @@ def _refuse(cells: Cells, level: Level, folded: Ints, number: int) -> None:
     raise ValueError(
         f"the planar surface folds (det J <= 0) at level {number} at the tagged corner, vertex {corner} with "
         f"{level.vertex_num_faces[level.control_vertex == corner][0]} faces, on faces {faces[:SHOWN].tolist()}: plain "
-        f"masks "
-        f"span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the spacing "
-        f"of the "
-        f"edges next to it, or remove its tag"
+        f"masks span at most 90 degrees a face and want even spacing there. Add faces at the corner, even out the "
+        f"spacing of the edges next to it, or remove its tag"
     )

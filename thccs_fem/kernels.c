@@ -363,7 +363,7 @@ static void smooth_bubbles(int is_mirrored, double r, double s, double t, double
 }
 
 /* Local B-spline coefficients (16, 4) of bubbles on a piece, which begins at origin in its cell and has edges u and v
-   there, the columns of axes: one of them along x, the other along y. For smooth ones it lies in a quarter of the cell. */
+   there, the columns of axes: one of them along x, the other along y. For smooth ones it lies in a quarter of it. */
 static void bubbles_on_piece(int are_smooth, const double *origin, const double *axes, double *bubbles)
 {
   double factors[2][4][2]; /* along x and along y */
@@ -444,13 +444,50 @@ static double *cut_coefficients(const thccs_integral *integral, int quarter, con
   return out;
 }
 
+/* Add what `add_on_bubbles` adds, for the part of the cell that work->points map. */
+INLINE void add_part(const thccs_integral *integral, int32_t bs, int are_smooth, const double *origin,
+                     const double *axes, const double *own, const double *coefficients, workspace *work,
+                     double *matrix, double *residual)
+{
+  double b[LOCAL * BUBBLES];
+  bubbles_on_piece(are_smooth, origin, axes, b);
+  integrate(integral, own, LOCAL * bs * (coefficients ? LOCAL * bs : 1), work);
+  if (bs == 1)
+    add_on_bubbles(1, b, work->piece_tensor, coefficients, matrix, residual);
+  else
+    add_on_bubbles(bs, b, work->piece_tensor, coefficients, matrix, residual);
+}
+
+/* Likewise for a piece that is a whole cell: smooth bubbles are polynomials in each of its quarters alone. */
+INLINE void add_quarters(const thccs_integral *integral, int32_t bs, const double *origin, const double *axes,
+                         const double *own, const double *coefficients, workspace *work, double *matrix,
+                         double *residual)
+{
+  double points[3 * LOCAL];
+  memcpy(points, work->points, sizeof points);
+  for (int q = 0; q < 4; ++q) {
+    double from[2], along[4];
+    for (int d = 0; d < 2; ++d) {
+      from[d] = origin[d] + (q % 2 * axes[2 * d] + q / 2 * axes[2 * d + 1]) / 2.0;
+      along[2 * d] = axes[2 * d] / 2.0;
+      along[2 * d + 1] = axes[2 * d + 1] / 2.0;
+    }
+    cut(q, 3, points, work->points);
+    double *behind = cut_coefficients(integral, q, own, work->part_coefficients);
+    if (coefficients)
+      cut(q, bs, coefficients, behind);
+    add_part(integral, bs, 1, from, along, work->part_coefficients, coefficients ? behind : NULL, work, matrix,
+             residual);
+  }
+}
+
 int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
                               int32_t are_smooth, const double *origins, const double *axes,
                               const double *coefficients, double *matrices, double *residuals)
 {
   workspace work;
   const int32_t bs = block_size;
-  const int64_t columns = coefficients ? LOCAL * bs : 1, n = BUBBLES * bs;
+  const int64_t n = BUBBLES * bs;
   void *memory = make_workspace(&work, batch, integral, coefficients ? bs * bs : bs);
   if (!memory)
     return -1;
@@ -462,34 +499,10 @@ int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *in
       const double *origin = origins + 2 * piece, *axis = axes + 4 * piece;
       const double *own = load_piece(1, batch, integral, piece, &work);
       const double *c = coefficients ? coefficients + LOCAL * bs * piece : NULL;
-      double b[LOCAL * BUBBLES], points[3 * LOCAL];
-      memcpy(points, work.points, sizeof points);
-      /* A piece that is a whole cell has smooth bubbles that are polynomials in each of its quarters alone. */
-      const int is_cut = are_smooth && fabs(axis[0]) + fabs(axis[1]) > 0.75;
-      for (int q = 0; q < (is_cut ? 4 : 1); ++q) {
-        const double *w = own, *u = c;
-        double from[2], along[4];
-        for (int d = 0; d < 2; ++d) {
-          from[d] = origin[d] + (is_cut ? (q % 2 * axis[2 * d] + q / 2 * axis[2 * d + 1]) / 2.0 : 0.0);
-          for (int e = 0; e < 2; ++e)
-            along[2 * d + e] = is_cut ? axis[2 * d + e] / 2.0 : axis[2 * d + e];
-        }
-        if (is_cut) {
-          cut(q, 3, points, work.points);
-          double *next = cut_coefficients(integral, q, own, work.part_coefficients);
-          w = work.part_coefficients;
-          if (c) {
-            cut(q, bs, c, next);
-            u = next;
-          }
-        }
-        bubbles_on_piece(are_smooth, from, along, b);
-        integrate(integral, w, LOCAL * bs * columns, &work);
-        if (bs == 1)
-          add_on_bubbles(1, b, work.piece_tensor, u, matrix, residual);
-        else
-          add_on_bubbles(bs, b, work.piece_tensor, u, matrix, residual);
-      }
+      if (are_smooth && fabs(axis[0]) + fabs(axis[1]) > 0.75)
+        add_quarters(integral, bs, origin, axis, own, c, &work, matrix, residual);
+      else
+        add_part(integral, bs, are_smooth, origin, axis, own, c, &work, matrix, residual);
     }
   }
   free(memory);

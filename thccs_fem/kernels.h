@@ -53,12 +53,12 @@ int thccs_assemble_matrix(const thccs_batch *batch, const thccs_integral *integr
                           const int32_t *indptr, const int64_t *starts, int32_t position_size,
                           const void *positions, double *values);
 
-/* Local problems on four bubble functions a cell, products of two polynomials along each side: the inner cubic Bernstein
-   polynomials, or, smooth, Hermite's cubics in the middle of the side, piecewise and with no slope at the ends. Pieces lie
-   in their cells at origins (pieces, 2), along axes (pieces, 2, 2), each with smooth bubbles in one quarter of its cell, or
-   it is the cell. Of a linear form, with coefficients NULL: residuals (cells, 4 * block_size) += form of the bubbles. Of a
-   bilinear form, with local coefficients (pieces, 16, block_size) of a function: matrices (cells, 4 * block_size, 4 *
-   block_size) += form of them, residuals -= form of function and them. */
+/* Local problems on four bubble functions a cell, products of two polynomials along each side: the inner cubic ones
+   of Bernstein or, smooth, Hermite's cubics in the middle of the side, piecewise and with no slope at the ends. Pieces
+   lie in their cells at origins (pieces, 2), along axes (pieces, 2, 2), each with smooth bubbles in one quarter of its
+   cell, or it is the cell. Of a linear form, with coefficients NULL: residuals (cells, 4 * block_size) += form of the
+   bubbles. Of a bilinear form, with local coefficients (pieces, 16, block_size) of a function: matrices (cells, 4 *
+   block_size, 4 * block_size) += form of them, residuals -= form of function and them. */
 int thccs_assemble_on_bubbles(const thccs_batch *batch, const thccs_integral *integral, int32_t block_size,
                               int32_t are_smooth, const double *origins, const double *axes,
                               const double *coefficients, double *matrices, double *residuals);

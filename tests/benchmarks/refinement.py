@@ -81,7 +81,7 @@ class Problem:
     def forms(self, V: FunctionSpace) -> tuple[ufl.Form, ufl.Form]:
         u, v, exact = ufl.TrialFunction(V), ufl.TestFunction(V), self.exact(ufl.SpatialCoordinate(V.mesh))
         a, L = inner(grad(u), grad(v)), fem.Constant(V.mesh, 0.0) * v
-        if V.mesh.gdim == 3:  # the load is a(exact, v): UFL can't write the surface's operator of a function of space
+        if V.mesh.gdim == 3:  # the load is a(exact, v), which needs no curvature
             return (a + u * v) * dx, (inner(grad(exact), grad(v)) + exact * v) * dx
         return a * dx, (L if self.harmonic else -div(grad(exact)) * v) * dx
 

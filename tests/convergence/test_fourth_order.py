@@ -7,19 +7,19 @@ weaker norms have second derivatives there as well. docs/fourth_order.md has the
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import cos, log2, pi, sqrt
+from math import pi
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from problems import lifted, smooth, uniformly_refined, wavy
+from problems import halvings, laplacian, lifted, smooth, tangential, uniformly_refined, wavy
 
 import ufl
 from thccs_fem import adapt, estimate, fem, generators
 from thccs_fem.fem.scipy import LinearProblem
 from thccs_fem.forms import biharmonic, plate
 from thccs_fem.mesh import ControlMesh
-from ufl import div, dot, dx, grad, inner
+from ufl import div, dx, grad, inner
 
 Expr = ufl.core.expr.Expr
 Floats = npt.NDArray[np.float64]
@@ -33,19 +33,8 @@ DEEP, DEEPER, SHALLOW = 10, 14, 1  # cap levels; where rings shrink slowly they 
 
 def at_extraordinary(valence: int) -> tuple[float, float, float]:
     """Return the rates of a space that holds linear functions near the vertex and no quadratic ones."""
-    c = cos(2 * pi / valence)
-    rate = -log2((5 + c + cos(pi / valence) * sqrt(18 + 2 * c)) / 16)
+    rate = halvings(valence)
     return min(2.0, rate), min(3.0, 2 * rate), min(4.0, 2 * rate)
-
-
-def tangential(V: fem.FunctionSpace, gradient: Expr) -> Expr:
-    domain = V.mesh.ufl_domain()
-    return dot(ufl.Jacobian(domain) * ufl.JacobianInverse(domain), gradient)
-
-
-def laplacian(V: fem.FunctionSpace, w: Expr) -> Expr:
-    """Return the Laplace-Beltrami operator of a function of space: UFL's own knows nothing of the surface."""
-    return div(tangential(V, grad(w)))
 
 
 def norm(density: Expr) -> float:
@@ -87,12 +76,12 @@ def on_a_surface(V: fem.FunctionSpace) -> list[float]:
     """
     exact = smooth(ufl.SpatialCoordinate(V.mesh))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    load = (laplacian(V, exact) * div(grad(v)) + exact * v) * dx
+    load = (laplacian(V.mesh, exact) * div(grad(v)) + exact * v) * dx
     dofs = fem.boundary_dofs(V, slope=True)
     bcs = [fem.dirichletbc(exact, dofs, V, slope=True)] if dofs.size else []
     uh = LinearProblem(biharmonic.a(u, v) + u * v * dx, load, bcs=bcs).solve()
-    gradient = grad(uh) - tangential(V, grad(exact))
-    differences = (div(grad(uh)) - laplacian(V, exact), uh - exact)
+    gradient = grad(uh) - tangential(V.mesh, grad(exact))
+    differences = (div(grad(uh)) - laplacian(V.mesh, exact), uh - exact)
     return [norm(inner(e, e)) for e in (differences[0], gradient, differences[1])]
 
 

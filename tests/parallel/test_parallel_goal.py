@@ -85,3 +85,10 @@ def test_what_one_rank_gets_wrong_is_refused_by_all(comm: MPI.Comm) -> None:
     with pytest.raises((ValueError, RuntimeError), match="dofs run from 0"):
         estimate.goal(uh, *problem.forms(uh), fixed=fixed, problem=direct)
     assert uniformly_refined(problem.V).num_dofs > problem.V.num_dofs  # all ranks are here
+
+
+def test_dofs_are_found_anew(comm: MPI.Comm) -> None:
+    problem = LINEAR["mean over a part"](comm)
+    uh, found = problem.solve(problem.V, direct), fem.boundary_dofs(problem.V)
+    with pytest.raises(ValueError, match=r"fixed returned the same dofs for the space of uh and for its refinement"):
+        estimate.goal(uh, *problem.forms(uh), fixed=lambda W: found, problem=direct)

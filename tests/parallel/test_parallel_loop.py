@@ -250,6 +250,12 @@ def test_estimates_are_those_of_the_whole(comm: MPI.Comm) -> None:
     ):
         run(part, adapt.Stop(tolerance=1.0))
 
+    for other in (lambda u: part(u)[0], lambda u: (part(u)[0], np.nan)):
+        with pytest.raises(
+            ValueError, match="the estimator returned the estimate nan: it must be finite, on all ranks"
+        ):
+            run(lambda u, other=other: part(u) if comm.rank else other(u), adapt.Stop(steps=1))
+
     history = run(lambda u: (part(u)[0], 1.0 + 1e-12 * comm.rank), adapt.Stop(tolerance=1.0))  # rounding
     assert (len(history.steps), history["estimate"][0]) == (1, 1.0)
 

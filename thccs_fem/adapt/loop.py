@@ -19,7 +19,7 @@ from thccs_fem.adapt.resuming import Solution, begun, listed, resumed, save
 from thccs_fem.adapt.transfer import transfer
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace, check_space
-from thccs_fem.parallel import by_first_rank, largest, rank_of, smallest, together
+from thccs_fem.parallel import by_first_rank, largest, rank_of, smallest, together, total
 from thccs_fem.partition import partition
 
 __all__ = ["Problem", "solve"]
@@ -117,22 +117,22 @@ def solve(
                     reason = "no function is marked, or none that can be refined"
                     break
             u = _solution(V, problem(V), run.history.solution)
-            eta, total = _estimated(V, estimator(u))
-            step = _step(V, u, len(run.history.steps), total, largest(V.mesh.comm, time.perf_counter() - start))
+            eta, error = _estimated(V, estimator(u))
+            step = _step(V, u, len(run.history.steps), error, largest(V.mesh.comm, time.perf_counter() - start))
             if callback is not None:
                 step = replace(step, values=_numbers(V, callback(step, u)))
             run = replace(run, V=V, history=History((*run.history.steps, step), u), eta=eta)
             if checkpoint is not None:
                 save(checkpoint, run)
             reason = _reason(V, stop(run.history))
-            bar.set_postfix(dofs=step.dofs, estimate=f"{abs(total):.2e}")
+            bar.set_postfix(dofs=step.dofs, estimate=f"{abs(error):.2e}")
             bar.update()
     return replace(run.history, reason=reason)
 
 
-def _step(V: FunctionSpace, u: Solution, number: int, total: float, seconds: float) -> Step:
+def _step(V: FunctionSpace, u: Solution, number: int, error: float, seconds: float) -> Step:
     dofs = sum(function.function_space.num_dofs for function in listed(u))
-    return Step(number, V.num_levels, V.num_cells, dofs, total, seconds, partition(V.hierarchy).imbalance)
+    return Step(number, V.num_levels, V.num_cells, dofs, error, seconds, partition(V.hierarchy).imbalance)
 
 
 # ---- The user's functions, and what they return ----------------------------------------------------------------------
@@ -191,19 +191,21 @@ def _guess(u: Solution, last: Solution) -> None:
 
 def _estimated(V: FunctionSpace, returned: Any) -> tuple[Floats, float]:
     """Return the indicators and the estimate."""
-    eta, value = together(V.mesh.comm, lambda: _checked(partition(V.hierarchy).cells.size_local, returned))
-    if value is None:
-        return eta, estimate.norm(V, eta)
     comm = V.mesh.comm
-    least, most = smallest(comm, value), largest(comm, value)
-    if not np.isfinite([least, most]).all():
-        raise ValueError(f"the estimator returned {value} as the estimate of the error: it must be finite")
+    eta, value = together(comm, lambda: _checked(partition(V.hierarchy).cells.size_local, returned))
+    if not total(comm, int(value is not None)):
+        return eta, estimate.norm(V, eta)
+    mine = np.nan if value is None else value
+    least, most = smallest(comm, mine), largest(comm, mine)
+    for each in (least, most):
+        if not np.isfinite(each):
+            raise ValueError(f"the estimator returned the estimate {each}: it must be finite, on all ranks")
     if most - least > SAME * max(abs(least), abs(most)):
         raise ValueError(
             f"the estimator returned the estimate {least} on one rank, {most} on another: each must return that of the "
             f"whole, as V.mesh.comm.allreduce makes it of integrals over parts"
         )
-    return eta, by_first_rank(comm, lambda: value)
+    return eta, by_first_rank(comm, lambda: mine)
 
 
 def _checked(num_cells: int, returned: Any) -> tuple[Floats, float | None]:

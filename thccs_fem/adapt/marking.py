@@ -16,13 +16,23 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from thccs_fem.extraction import Cells
-from thccs_fem.fem.space import FunctionSpace
+from thccs_fem.fem.space import FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy, Stage
 from thccs_fem.index_map import IndexMap
 from thccs_fem.parallel import together
 from thccs_fem.partition import Partition, partition
 
-__all__ = ["TIE", "Marking", "Strategy", "mark", "mark_coarsening", "on_all_cells", "places", "uniform"]
+__all__ = [
+    "TIE",
+    "Marking",
+    "Strategy",
+    "in_turn",
+    "mark",
+    "mark_coarsening",
+    "on_all_cells",
+    "uniform",
+    "until_carried",
+]
 
 Floats = npt.NDArray[np.float64]
 Strategy = Literal["worst", "maximum", "dorfler"]
@@ -83,7 +93,7 @@ def mark(V: FunctionSpace, eta: Floats, strategy: Strategy = "dorfler", theta: f
     if not indicator.any():
         return np.zeros(0, dtype=np.int64)
     if strategy == "worst":
-        return np.array([np.argmax(places(indicator))])
+        return np.array([np.argmax(_places(indicator))])
     if strategy == "maximum":
         return np.flatnonzero(indicator >= theta * indicator.max() * (1.0 - TIE))
     return _dorfler(parts, units, indicator, squares, theta)
@@ -120,7 +130,7 @@ def mark_coarsening(V: FunctionSpace, eta: Floats, theta: float = 0.05) -> npt.N
     squares = on_all_cells(V, eta) ** 2
     if not 0.0 <= theta < 1.0:
         raise ValueError(f"theta is {theta}; it must lie in [0, 1)")
-    order = np.argsort(places(squares), kind="stable")
+    order = np.argsort(_places(squares), kind="stable")
     carried = np.cumsum(squares[order])
     marks = np.zeros(order.size, dtype=bool)
     marks[order] = carried <= theta * carried[-1] * (1.0 + TIE)
@@ -137,6 +147,7 @@ def _check_rule(strategy: Strategy, theta: float) -> None:
 
 def on_all_cells(V: FunctionSpace, eta: npt.ArrayLike) -> Floats:
     """Return the indicators of all cells, by their numbers in the hierarchy."""
+    check_space(V, "marking")
     cells = partition(V.hierarchy).cells
     return cells.gather(together(V.mesh.comm, lambda: _checked(cells.size_local, eta)))
 
@@ -204,7 +215,7 @@ def _dofs_at_vertices(stage: Stage, first: int) -> npt.NDArray[np.int64]:
     return dofs
 
 
-def places(values: Floats) -> npt.NDArray[np.int64]:
+def _places(values: Floats) -> npt.NDArray[np.int64]:
     """Return the place of each value among all different ones, ascending, shape (n,); ties share one."""
     order = np.argsort(values)
     rising = values[order]
@@ -217,12 +228,32 @@ def _dorfler(
     parts: Partition, units: sp.csr_array, indicator: Floats, squares: Floats, theta: float
 ) -> npt.NDArray[np.int64]:
     """Take functions by falling indicator until their units carry theta; leave out those that add no cell."""
-    order = np.argsort(-places(indicator), kind="stable")
-    turn = np.zeros(order.size, dtype=np.int64)
-    turn[order] = np.arange(order.size)
+    order, turn = in_turn(indicator)
     by_cell = sp.csc_array(units)
     turns = turn[parts.functions.numbers[by_cell.indices]]
     first = parts.cells.gather(np.minimum.reduceat(turns, by_cell.indptr[:-1]))
-    carried = np.cumsum(np.bincount(first, weights=squares, minlength=order.size))
-    last = np.searchsorted(carried, theta * carried[-1] * (1.0 - TIE))
-    return np.sort(order[np.unique(first[first <= last])])
+    return until_carried(order, first, squares, theta)
+
+
+def in_turn(indicator: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the functions by falling indicator, those that tie by number, and the turn of each, shapes (n,)."""
+    order = np.argsort(-_places(indicator), kind="stable")
+    turn = np.zeros(order.size, dtype=np.int64)
+    turn[order] = np.arange(order.size)
+    return order, turn
+
+
+def until_carried(
+    order: npt.NDArray[np.int64], first: npt.NDArray[np.int64], squares: Floats, theta: float
+) -> npt.NDArray[np.int64]:
+    """Return the functions whose turn comes until they carry theta, but for those that add no cell, ascending.
+
+    Args:
+        order: The functions in turn, shape (n,).
+        first: For each cell the turn of the first function that brings it; n if none does.
+        squares: Squared indicators of cells.
+        theta: What is to be carried of their sum.
+    """
+    carried = np.cumsum(np.bincount(first, weights=squares, minlength=order.size)[: order.size])
+    last = np.searchsorted(carried, theta * squares.sum() * (1.0 - TIE))
+    return np.sort(order[np.unique(first[(first <= last) & (first < order.size)])])

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from thccs_fem.adapt.marking import TIE, on_all_cells, places
+from thccs_fem.adapt.marking import TIE, in_turn, on_all_cells, until_carried
 from thccs_fem.fem.space import FunctionSpace, check_space
 from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.sparse import csr, entries, product, rows_of, transposed
@@ -92,8 +92,8 @@ def predict(
 
     Raises:
         TypeError: If V is no space of splines, or `before` no prediction.
-        ValueError: If eta does not fit the cells or is negative or not finite, or the order is not positive, or V is
-            no refinement of the space before.
+        ValueError: If eta does not fit the cells or is negative or not finite, or the order is no more than 0.25,
+            or V is no refinement of the space before.
     """
     check_space(V, "prediction")
     if not isinstance(before, Prediction | None):
@@ -135,18 +135,12 @@ def _key_ranges(hierarchy: Hierarchy, depth: int) -> tuple[npt.NDArray[np.int64]
 def _marked(hierarchy: Hierarchy, squares: Floats, theta: float) -> npt.NDArray[np.int64]:
     """Return the fewest functions, largest indicators first, whose units carry theta of the sum of squares."""
     cell, dof = _incidence(hierarchy)
-    num_dofs = hierarchy.num_dofs
-    indicator = np.sqrt(np.bincount(dof, weights=squares[cell], minlength=num_dofs))
-    order = np.argsort(-places(indicator), kind="stable")
-    turn = np.zeros(num_dofs, dtype=np.int64)
-    turn[order] = np.arange(num_dofs)
-    first = np.full(squares.size, num_dofs)
+    order, turn = in_turn(np.sqrt(np.bincount(dof, weights=squares[cell], minlength=hierarchy.num_dofs)))
+    first = np.full(squares.size, order.size)
     begins = np.flatnonzero(np.diff(cell, prepend=-1))
     if begins.size:
         first[cell[begins]] = np.minimum.reduceat(turn[dof], begins)
-    carried = np.cumsum(np.bincount(first, weights=squares, minlength=num_dofs + 1)[:num_dofs])
-    last = np.searchsorted(carried, theta * squares.sum() * (1.0 - TIE))
-    return np.sort(order[np.unique(first[(first <= last) & (first < num_dofs)])])
+    return until_carried(order, first, squares, theta)
 
 
 def _incidence(hierarchy: Hierarchy) -> tuple[Ints, npt.NDArray[np.int64]]:

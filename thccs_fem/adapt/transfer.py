@@ -42,9 +42,12 @@ def transfer(
         conserve: Add a constant to each component that keeps its integral as it is measured, to rounding.
 
     Raises:
+        TypeError: If u is no function, or one of the spaces none of splines.
         ValueError: If the spaces are not on the same mesh with the same boundary rule, or their values have different
             shapes, or the projection is none of ours.
     """
+    if not isinstance(u, Function):
+        raise TypeError(f"u is of type {type(u).__name__}; it must be a fem.Function: of several give one at a time")
     W = u.function_space
     for space in (W, V):
         check_space(space, "transfer")

@@ -112,8 +112,9 @@ def goal(
     P = Prolongation(W.hierarchy, V.hierarchy)
     given = coarse = _Equations(F, J, uh, V)
     fine = middle = given.at(_carried(P, uh, W), W)
-    (dofs, jump), (coarse_dofs, _) = _prescribed(fine.u, fixed), _prescribed(uh, fixed)
-    _check_found_anew(P, V, W, coarse_dofs, dofs)
+    in_W, in_V = _Prescribed.of(fixed, W), _Prescribed.of(fixed, V)
+    (dofs, jump), (coarse_dofs, _) = in_W.at(fine.u), in_V.at(uh)
+    _check_found_anew(P, V, coarse_dofs, dofs, in_W.has_dofs_of(in_V))
     fine.check_means(dofs)
     residual, change_of_goal = fine.residual(), fine.goal() - given.goal()
     if not fine.is_linear:
@@ -182,7 +183,8 @@ class _Equations:
             bc = DirichletBC(self.space, dofs, np.zeros(dofs.size))
             return _solved(problem, self.adjoint, self.slope, bc)
         except (ValueError, RuntimeError) as error:
-            error.add_note("This is the dual problem. See that `fixed` returns all that is prescribed for uh.")
+            if not isinstance(error, NotImplementedError):  # that is SciPy on several ranks
+                error.add_note("This is the dual problem. See that `fixed` returns all that is prescribed for uh.")
             raise
 
     def balance(self, dofs: Ints) -> Floats:
@@ -284,37 +286,56 @@ def _over_supports(V: FunctionSpace, amounts: Floats) -> Floats:
     return np.maximum(assemble_cells(form(density * ufl.dx)), 0.0)  # functions are not negative; rounding may be
 
 
-def _prescribed(u: Function, fixed: Fixed | None) -> tuple[Ints, Floats]:
-    """Return the prescribed dofs, ascending, local, ghosts included, and by how much u misses the values if there are.
+@dataclass(frozen=True, eq=False)
+class _Prescribed:
+    """What `fixed` returned for a space: conditions, or functions alone, as conditions of zero."""
 
-    Of functions alone, nothing.
-    """
-    V = u.function_space
-    given: Any = [] if fixed is None else fixed(V)
-    if given is None:
-        raise TypeError("fixed returned None: let it return what is prescribed in the space that it is called with")
-    listed: Any = [given] if isinstance(given, DirichletBC) else given
-    if isinstance(listed, Sequence) and all(isinstance(bc, DirichletBC) for bc in listed):
-        dofs, values = constraints(listed, V)
-        return dofs, values - u.x.array[dofs]
-    dofs, _ = constraints([dirichletbc(0.0, listed, V)], V)
-    return dofs, np.zeros(dofs.size)
+    bcs: Sequence[DirichletBC]
+    has_values: bool
+
+    @classmethod
+    def of(cls, fixed: Fixed | None, V: FunctionSpace) -> _Prescribed:
+        given: Any = [] if fixed is None else fixed(V)
+        if given is None:
+            raise TypeError("fixed returned None: let it return what is prescribed in the space that it is called with")
+        listed: Any = [given] if isinstance(given, DirichletBC) else given
+        if isinstance(listed, Sequence) and all(isinstance(bc, DirichletBC) for bc in listed):
+            return cls(listed, True)
+        return cls([dirichletbc(0.0, listed, V)], False)
+
+    def at(self, u: Function) -> tuple[Ints, Floats]:
+        """Return the prescribed dofs, ascending, local, ghosts included, and by how much u misses the values if any."""
+        dofs, values = constraints(self.bcs, u.function_space)
+        return dofs, values - u.x.array[dofs] if self.has_values else np.zeros(dofs.size)
+
+    def has_dofs_of(self, other: _Prescribed) -> bool:
+        """Return whether this rank has been given the same numbers."""
+        mine, others = ([bc.dofs for bc in each.bcs] for each in (self, other))
+        return len(mine) == len(others) and all(map(np.array_equal, mine, others))
 
 
-def _check_found_anew(P: Prolongation, V: FunctionSpace, W: FunctionSpace, coarse_dofs: Ints, dofs: Ints) -> None:
-    """Raise if dofs that were found for V are taken for those of W: others than functions free in V need.
+def _check_found_anew(P: Prolongation, V: FunctionSpace, coarse_dofs: Ints, dofs: Ints, same: bool) -> None:
+    """Raise if dofs that were found for V are taken for those of its refinement.
+
+    Args:
+        P: The prolongation to the refinement.
+        V: The space.
+        coarse_dofs: What is prescribed there.
+        dofs: What is prescribed in the refinement.
+        same: Whether `fixed` has returned the same numbers for both to this rank.
 
     Raises:
-        ValueError: The numbers are the same, but functions that are free in V have some of the prescribed dofs in W.
+        ValueError: It has on all ranks, but functions that are free in V have some of the prescribed dofs.
     """
-    free = np.ones((V.num_local_dofs // V.block_size, V.block_size))
-    free.ravel()[coarse_dofs] = 0.0
-    comm, others = V.mesh.comm, int(not np.array_equal(coarse_dofs, dofs))
-    touched = np.count_nonzero(P(free).ravel()[dofs] > FREE)
-    if not total(comm, others) and total(comm, touched):
+    if total(V.mesh.comm, int(not same)):
+        return
+    free = np.ones(V.num_local_dofs)
+    free[coarse_dofs] = 0.0
+    wrong = P(free.reshape(-1, V.block_size)).ravel()[dofs] > FREE
+    if total(V.mesh.comm, np.count_nonzero(wrong)):
         raise ValueError(
-            f"fixed returned the same dofs for {V} and for {W}, but they are others there: let it find them in the "
-            f"space that it is called with, as fem.boundary_dofs or lambda W: fem.boundary_dofs(W) do"
+            "fixed returned the same dofs for the space of uh and for its refinement, but they are others there: let "
+            "it find them in the space that it is called with, as fem.boundary_dofs or lambda W: fem.boundary_dofs(W)"
         )
 
 

@@ -83,8 +83,8 @@ def residual(
 
     h is the root of the area of K, unless K consists of several pieces. At order 4 it is the size of the piece, the
     root of |det J| at each point: near an extraordinary vertex fourth derivatives are not square-integrable. Nor are
-    second ones at a reentrant corner: at order 2 it is the geometric mean of both sizes. So indicators do not depend
-    on the level of the caps.
+    second ones at a reentrant corner: at order 2 it is the geometric mean of both sizes. So indicators do not grow with
+    the level of the caps. (Where solutions are smooth they get smaller with it, to a third at a vertex of valence 8.)
 
     Where `reaction` c is large an error reaches no farther than the length (stiffness / c)^(1 / order), and h^p / F, F
     the factor of the term, is to be read as 1 / (F / h^p + (c / stiffness)^(p / order)). So the energy norm is

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # imported where it is needed: it takes its time
 __all__ = ["convergence"]
 
 STYLES = ("o-", "s--", "^:", "D-.")  # of curves
+DATELESS = {".svg": {"Date": None}, ".svgz": {"Date": None}, ".pdf": {"CreationDate": None}}  # the same file each time
 
 Floats = npt.NDArray[np.float64]
 
@@ -39,7 +40,7 @@ def convergence(
     filename: str | os.PathLike[str],
     *,
     columns: str | Sequence[str] = "estimate",
-    slopes: Sequence[float] = (1.5, 2.0),
+    slopes: float | Sequence[float] = (1.5, 2.0),
     title: str = "",
 ) -> Figure:
     """Draw columns of one or several adaptive runs over their dofs, on logarithmic scales; collective, rank 0 writes.
@@ -51,7 +52,8 @@ def convergence(
             of arrays, "dofs" one of them, does for a run as well.
         filename: The file to write, of any type that Matplotlib writes, such as PNG, PDF and SVG.
         columns: Their names, see `adapt.History.columns`; what a run lacks is left out.
-        slopes: Rates r to compare with, in lines that fall like dofs^-r. Cubic functions come to 3/2 in H1, to 2 in L2.
+        slopes: Rates r to compare with, one or several, in lines that fall like dofs^-r; () for none. Cubic functions
+            come to 3/2 in H1, to 2 in L2.
         title: Title of the picture.
 
     Returns:
@@ -59,13 +61,18 @@ def convergence(
 
     Raises:
         KeyError: A column is in none of the runs.
-        ValueError: There is nothing to draw, or Matplotlib does not write files of this type.
+        TypeError: A run is no table with a column of dofs.
+        ValueError: There is nothing to draw, or a column is not as long as that of the dofs, or Matplotlib does not
+            write files of this type.
         OSError: The file cannot be written.
     """
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     runs = _runs(histories)
     names = [columns] if isinstance(columns, str) else list(columns)
+    if not names:
+        raise ValueError("there are no columns to draw: give a name or several")
     curves = [_Curve(run, name, *found) for run in runs for name in names if (found := _points(runs[run], name))]
     missing = [name for name in names if name not in {curve.column for curve in curves}]
     if missing:
@@ -77,14 +84,19 @@ def convergence(
         label = ", ".join(part for part, many in ((curve.run, runs), (curve.column, names)) if len(many) > 1)
         colour = f"C{i if len(runs) > 1 else j}"
         axes.loglog(curve.dofs, curve.values, STYLES[j % len(STYLES)], color=colour, markersize=4.0, label=label)
-    _draw_slopes(axes, curves, slopes)
+    _draw_slopes(axes, curves, [slopes] if isinstance(slopes, float | int) else slopes)
     axes.set(xlabel="dofs", ylabel=names[0] if len(names) == 1 else "", title=title)
     axes.grid(which="major", color="0.9")
     if len(curves) > 1:
         axes.legend(frameon=False)
     path = Path(filename)
     endings = [f".{ending}" for ending in figure.canvas.get_supported_filetypes()]
-    by_first_rank(_comm(runs), lambda: figure.savefig(paths.checked(path, endings), dpi=150))
+
+    def write() -> None:
+        with rc_context({"svg.hashsalt": "convergence"}):  # or names in it would be random
+            figure.savefig(paths.checked(path, endings), dpi=150, metadata=DATELESS.get(path.suffix.lower()))
+
+    by_first_rank(_comm(runs), write)
     return figure
 
 
@@ -104,6 +116,15 @@ def _runs(histories: Any) -> dict[str, Any]:
     runs = dict(histories) if several else {"": histories}
     if not runs:
         raise ValueError("there are no runs to draw: give a history, or several by name")
+    for name, run in runs.items():
+        try:
+            run["dofs"]
+        except (KeyError, IndexError, TypeError):
+            which = f" {name!r}" if several else ""
+            raise TypeError(
+                f'the run{which}, of type {type(run).__name__}, has no column "dofs": give a history, or several by '
+                f'name, as {{"adaptive": one, "uniform": other}}'
+            ) from None
     return runs
 
 
@@ -113,8 +134,11 @@ def _points(run: Any, column: str) -> tuple[Floats, Floats] | None:
         values = np.abs(np.asarray(run[column], dtype=np.float64))
     except KeyError:
         return None
+    dofs = np.asarray(run["dofs"], dtype=np.float64)
+    if values.shape != dofs.shape:
+        raise ValueError(f"the column {column!r} has shape {values.shape}, that of the dofs {dofs.shape}")
     used = np.isfinite(values) & (values > 0.0)
-    return (np.asarray(run["dofs"], dtype=np.float64)[used], values[used]) if used.any() else None
+    return (dofs[used], values[used]) if used.any() else None
 
 
 def _comm(runs: Mapping[str, Any]) -> Any:
