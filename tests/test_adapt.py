@@ -80,6 +80,11 @@ def test_marks_are_numbers_of_functions(marked: npt.ArrayLike) -> None:
         adapt.refine(space("grid"), marked)
 
 
+def test_how_marks_become_numbers_is_said() -> None:
+    with pytest.raises(TypeError, match=r"got bool: np.flatnonzero\(marks\) makes numbers of marks"):
+        adapt.refine(space("grid"), np.ones(42, dtype=bool))
+
+
 # ---- Coarsening
 
 

@@ -10,8 +10,8 @@ from goals import KNOWN, LEFT, LINEAR, NONLINEAR, Problem, bumps, l_shaped, squa
 from problems import randomly_refined, refined_towards, uniformly_refined
 
 import ufl
-from thccs_fem import adapt, estimate, fem
-from thccs_fem.fem.scipy import NonlinearProblem
+from thccs_fem import adapt, estimate, fem, generators
+from thccs_fem.fem.scipy import LinearProblem, NonlinearProblem
 from ufl import dx, grad, inner
 
 Floats = npt.NDArray[np.float64]
@@ -346,6 +346,22 @@ def test_dofs_are_found_anew() -> None:
         estimate.goal(uh, F, J, fixed=lambda W: fem.boundary_dofs(V))
     with pytest.raises(ValueError, match=r"fixed returned the same dofs"):
         estimate.goal(uh, F, J, fixed=lambda W: fem.dirichletbc(0.0, fem.boundary_dofs(V), W))
+
+
+def test_functions_of_a_vertex_may_have_one_number() -> None:
+    """In the refined space, too: it is that of the same place."""
+    V = fem.functionspace(generators.torus((6, 6)), ("THCCS", 3))
+    vertex = V.reference_points[7]
+
+    def nearest(W: fem.FunctionSpace) -> npt.NDArray[np.int64]:
+        return np.argmin(np.linalg.norm(W.reference_points - vertex, axis=1), keepdims=True)
+
+    assert nearest(V).tolist() == nearest(uniformly_refined(V)).tolist() == [7]
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    load = ufl.SpatialCoordinate(V.mesh)[0] * v * dx
+    uh = LinearProblem(inner(grad(u), grad(v)) * dx, load, bcs=[fem.dirichletbc(0.0, nearest(V), V)]).solve()
+    _, value = estimate.goal(uh, inner(grad(uh), grad(v)) * dx - load, inner(grad(uh), grad(uh)) * dx, fixed=nearest)
+    assert 0.0 < value < 0.1 * fem.assemble_scalar(fem.form(inner(grad(uh), grad(uh)) * dx))
 
 
 def test_conditions_that_were_left_out() -> None:

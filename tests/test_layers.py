@@ -29,7 +29,8 @@ LAYERS = """
     thccs_fem.estimate.goal
     thccs_fem.estimate thccs_fem.checkpoint
     thccs_fem.adapt.marking thccs_fem.adapt.prediction thccs_fem.adapt.remeshing thccs_fem.adapt.grading
-    thccs_fem.adapt.transfer thccs_fem.adapt.history thccs_fem.adapt.resuming thccs_fem.adapt.loop thccs_fem.adapt
+    thccs_fem.adapt.transfer thccs_fem.adapt.history thccs_fem.adapt.resuming thccs_fem.adapt.returned
+    thccs_fem.adapt.loop thccs_fem.adapt
     thccs_fem.vtk thccs_fem.io thccs_fem.plot.paths thccs_fem.plot.surfaces thccs_fem.plot.pictures
     thccs_fem.plot.curves thccs_fem.plot
     thccs_fem.dolfinx

@@ -243,6 +243,7 @@ def test_forms_say_whether_they_drop_constants() -> None:
         (laplace(V) + inner(div(grad(u)), div(grad(v))) * dx, [True, True]),
         (laplace(V) + u[1] * v[1] * dx, [True, False]),
         (laplace(V) + one_sided, [False, False]),
+        (ufl.adjoint(laplace(V) + one_sided), [False, False]),
         (ufl.derivative(ufl.derivative(energy, w, v), w, u), [False, True]),
     ]
     for form, expected in cases:

@@ -157,6 +157,25 @@ def test_run_ends_where_nothing_is_wrong() -> None:
     assert (len(few.steps), few.reason) == (2, history.reason)
 
 
+@pytest.mark.parametrize("looks_ahead", [False, True])
+def test_run_ends_where_levels_do(looks_ahead: bool) -> None:
+    """What it came to is not lost; also where it is the estimator that refines, by a level more."""
+
+    def estimator(u: fem.Function) -> Floats:
+        V = u.function_space
+        if looks_ahead:
+            adapt.refine(V, [V.num_functions - 1])
+        return np.ones(V.num_cells)
+
+    history = run(fem.Function, estimator, adapt.Stop(steps=99), marking=lambda V, eta: [V.num_functions - 1])
+    assert history["levels"].tolist() == list(range(1, 30 - looks_ahead))
+    assert history.reason.startswith(
+        "30 levels below the 12 faces of level 0 are more than 64-bit face keys can number"
+    )
+    with pytest.raises(ValueError, match="30 levels below the 12 faces"):  # nothing has been done, and may be lost
+        run(lambda V: fem.functionspace(V.mesh, ("THCCS", 3), cap_level=30), estimator)
+
+
 @pytest.mark.parametrize(
     ("given", "error", "message"),
     [
@@ -604,6 +623,8 @@ def test_columns_are_arrays() -> None:
     assert ("error" in history, "eror" in history) == (True, False)
     assert list(dict(history)) == list(history.columns)
     assert len(history) == 8
+    with pytest.raises(KeyError, match=r"no column 'rate'; .*, imbalance.*; rates of a column are rates\(column\)"):
+        history["rate"]
     with pytest.raises(KeyError, match="there is no column 'errors'; there are step, levels, elements, dofs, estimat"):
         history["errors"]
 

@@ -58,13 +58,17 @@ from thccs_fem.subdivision import (
     with_matrix,
 )
 
-__all__ = ["CAP_LEVEL", "Hierarchy", "Stage"]
+__all__ = ["CAP_LEVEL", "Hierarchy", "Stage", "TooDeepError"]
 
 UNITS = get_args(Unit)
 NO_MATRIX = sp.csr_array((0, 0))
 CAP_LEVEL = 4  # level at which the bicubic cap ends the cut at an irregular vertex, unless refinement goes deeper
 
 Keys = npt.NDArray[np.int64]
+
+
+class TooDeepError(ValueError):
+    """There are no numbers for the faces of a level that is so fine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,7 +473,7 @@ def _check_admissibility(admissibility: int | None) -> None:
 
 def _check_depth(root: Level, deepest: int) -> None:
     if root.num_faces * 4**deepest >= 2**62:
-        raise ValueError(
+        raise TooDeepError(
             f"{deepest} levels below the {root.num_faces} faces of level 0 are more than 64-bit face keys can number: "
             f"refine less or choose a smaller cap_level"
         )

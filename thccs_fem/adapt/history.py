@@ -144,7 +144,8 @@ class History(Mapping[str, npt.NDArray[Any]]):
         if column in COLUMNS:
             return np.array([getattr(step, COLUMNS[column]) for step in self.steps])
         if column not in self.columns:
-            raise KeyError(f"there is no column {column!r}; there are {', '.join(self.columns)}")
+            rates = "; rates of a column are rates(column)" * (column == "rate")
+            raise KeyError(f"there is no column {column!r}; there are {', '.join(self.columns)}{rates}")
         return np.array([step.values.get(column, np.nan) for step in self.steps])
 
     def __iter__(self) -> Iterator[str]:

@@ -11,29 +11,21 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from thccs_fem import estimate
-from thccs_fem.adapt.history import COLUMNS, History, Step
+from thccs_fem.adapt.history import History, Step
 from thccs_fem.adapt.marking import Marking
 from thccs_fem.adapt.remeshing import refine
 from thccs_fem.adapt.resuming import Solution, begun, listed, resumed, save
+from thccs_fem.adapt.returned import check_called, estimated, numbers_of, reason_of
 from thccs_fem.adapt.transfer import transfer
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace, check_space
-from thccs_fem.parallel import by_first_rank, largest, rank_of, smallest, together, total
+from thccs_fem.hierarchy import TooDeepError
+from thccs_fem.parallel import largest, rank_of
 from thccs_fem.partition import partition
 
 __all__ = ["Problem", "solve"]
 
 Floats = npt.NDArray[np.float64]
-
-SAME = 1e-6  # relative difference of the estimates on the ranks that may be rounding
-CALLED = {  # what arguments are functions of, and what does for one
-    "problem": "the space, such as lambda V: LinearProblem(...) with forms in V",
-    "estimator": "the solution, such as lambda uh: estimate.bubble(uh, a, L)",
-    "marking": 'the space and the indicators, such as adapt.Marking("dorfler", 0.5)',
-    "stop": "the history, such as adapt.Stop(tolerance=1e-3, dofs=10_000)",
-    "callback": "the step and the solution",
-}
 
 
 class Problem(Protocol):
@@ -85,7 +77,8 @@ def solve(
         checkpoint: The file to write to, and to go on from. `checkpoint.read` finds the solution in it, too.
 
     Returns:
-        The history with the last solution.
+        The history with the last solution. The run ends as well where nothing can be refined, or levels would be finer
+        than there are numbers for (30 or so).
 
     Raises:
         TypeError: If V is no space, or another argument no function; the problem is neither a problem nor a solution,
@@ -95,53 +88,54 @@ def solve(
             indicators are not one a cell, negative or not finite; or ranks have different estimates; or a name from the
             callback is taken.
     """
-    from tqdm import tqdm
-
     check_space(V, "adapt.solve")
-    _check_called(problem=problem, estimator=estimator, marking=marking, stop=stop, callback=callback)
+    check_called(problem=problem, estimator=estimator, marking=marking, stop=stop, callback=callback)
     run = begun(V) if checkpoint is None else resumed(checkpoint, V)
-    V, reason = run.V, _reason(run.V, stop(run.history)) if run.history.steps else None
-    most = getattr(stop, "steps", None)
-    with tqdm(
-        total=None if most is None else most + 1,
-        initial=len(run.history.steps),
-        desc="adaptive run",
-        unit="step",
-        disable=rank_of(V.mesh.comm) > 0 or (None if progress is None else not progress),
-    ) as bar:
+    V, reason = run.V, reason_of(run.V, stop(run.history)) if run.history.steps else None
+    with _progress_bar(V, getattr(stop, "steps", None), len(run.history.steps), progress) as bar:
         while reason is None:
             start = time.perf_counter()
-            if run.history.steps:
-                V = refine(run.V, marking(run.V, run.eta))
-                if V.num_cells == run.V.num_cells:
-                    reason = "no function is marked, or none that can be refined"
-                    break
-            u = _solution(V, problem(V), run.history.solution)
-            eta, error = _estimated(V, estimator(u))
+            try:
+                if run.history.steps:
+                    V = refine(run.V, marking(run.V, run.eta))
+                    if V.num_cells == run.V.num_cells:
+                        reason = "no function is marked, or none that can be refined"
+                        break
+                u = _solution(V, problem(V), run.history.solution)
+                eta, error = estimated(V, estimator(u))
+            except TooDeepError as end:  # also of what estimators refine
+                if not run.history.steps:
+                    raise
+                reason = str(end)
+                break
             step = _step(V, u, len(run.history.steps), error, largest(V.mesh.comm, time.perf_counter() - start))
             if callback is not None:
-                step = replace(step, values=_numbers(V, callback(step, u)))
+                step = replace(step, values=numbers_of(V, callback(step, u)))
             run = replace(run, V=V, history=History((*run.history.steps, step), u), eta=eta)
             if checkpoint is not None:
                 save(checkpoint, run)
-            reason = _reason(V, stop(run.history))
+            reason = reason_of(V, stop(run.history))
             bar.set_postfix(dofs=step.dofs, estimate=f"{abs(error):.2e}")
             bar.update()
     return replace(run.history, reason=reason)
 
 
+def _progress_bar(V: FunctionSpace, most: int | None, done: int, progress: bool | None) -> Any:
+    """Return a bar of a run that is to take at most so many steps after the first, if that is known."""
+    from tqdm import tqdm
+
+    return tqdm(
+        total=None if most is None else most + 1,
+        initial=done,
+        desc="adaptive run",
+        unit="step",
+        disable=rank_of(V.mesh.comm) > 0 or (None if progress is None else not progress),
+    )
+
+
 def _step(V: FunctionSpace, u: Solution, number: int, error: float, seconds: float) -> Step:
     dofs = sum(function.function_space.num_dofs for function in listed(u))
     return Step(number, V.num_levels, V.num_cells, dofs, error, seconds, partition(V.hierarchy).imbalance)
-
-
-# ---- The user's functions, and what they return ----------------------------------------------------------------------
-
-
-def _check_called(**given: object) -> None:
-    for name, value in given.items():
-        if not callable(value) and not (name == "callback" and value is None):
-            raise TypeError(f"{name} is of type {type(value).__name__}: give a function of {CALLED[name]}")
 
 
 def _is_solution(given: object) -> bool:
@@ -187,78 +181,3 @@ def _guess(u: Solution, last: Solution) -> None:
         )
     for function, before in zip(listed(u), listed(last), strict=True):
         function.x.array = transfer(before, function.function_space).x.array
-
-
-def _estimated(V: FunctionSpace, returned: Any) -> tuple[Floats, float]:
-    """Return the indicators and the estimate."""
-    comm = V.mesh.comm
-    eta, value = together(comm, lambda: _checked(partition(V.hierarchy).cells.size_local, returned))
-    if not total(comm, int(value is not None)):
-        return eta, estimate.norm(V, eta)
-    mine = np.nan if value is None else value
-    least, most = smallest(comm, mine), largest(comm, mine)
-    for each in (least, most):
-        if not np.isfinite(each):
-            raise ValueError(f"the estimator returned the estimate {each}: it must be finite, on all ranks")
-    if most - least > SAME * max(abs(least), abs(most)):
-        raise ValueError(
-            f"the estimator returned the estimate {least} on one rank, {most} on another: each must return that of the "
-            f"whole, as V.mesh.comm.allreduce makes it of integrals over parts"
-        )
-    return eta, by_first_rank(comm, lambda: mine)
-
-
-def _checked(num_cells: int, returned: Any) -> tuple[Floats, float | None]:
-    """Return the indicators and the estimate, None where it is their norm."""
-    wanted = f"one for each of the {num_cells} cells, ({num_cells},), or these and the estimate, (eta, estimate)"
-    parts = returned if isinstance(returned, tuple) else (returned, 0.0)
-    eta, value = (_real(part) for part in parts) if len(parts) == 2 else (None, None)
-    if eta is None or value is None or value.shape:
-        kinds = ", ".join(type(part).__name__ for part in parts)
-        kind = f"a tuple ({kinds})" if parts is returned else f"a {type(returned).__name__}"
-        raise TypeError(f"the estimator returned {kind}; it must return real indicators, {wanted}")
-    if eta.shape != (num_cells,):
-        raise ValueError(f"the estimator returned indicators of shape {eta.shape}; it needs {wanted}")
-    bad = np.flatnonzero(~(np.isfinite(eta) & (eta >= 0.0)))
-    if bad.size:
-        raise ValueError(
-            f"the estimator returned {eta[bad[0]]} for cell {bad[0]}, and {bad.size} such of {num_cells} indicators: "
-            f"they must be finite and not negative; is the solution finite?"
-        )
-    return eta, float(value) if parts is returned else None
-
-
-def _real(given: Any) -> Floats | None:
-    """Return real numbers as an array; None if they are none."""
-    try:
-        array = np.asarray(given)
-    except ValueError:  # of lists of arrays, say
-        return None
-    return array.astype(np.float64) if array.dtype.kind in "biuf" else None
-
-
-def _reason(V: FunctionSpace, returned: object) -> str | None:
-    """Return why the run ends, as rank 0 was told, on all ranks: clocks of others may say something else."""
-
-    def checked() -> str | None:
-        if not isinstance(returned, str | None):
-            raise TypeError(f"stop returned {returned!r}: return text, why the run ends, or None to go on")
-        return returned
-
-    return by_first_rank(V.mesh.comm, checked)
-
-
-def _numbers(V: FunctionSpace, returned: Any) -> Mapping[str, float]:
-    """Return the numbers of a callback, those of rank 0 on all ranks."""
-
-    def checked() -> dict[str, float]:
-        if not isinstance(returned, Mapping | None):
-            raise TypeError(f"the callback returned a {type(returned).__name__}: return None, or numbers by name")
-        for name, value in (returned or {}).items():
-            if not isinstance(name, str) or (number := _real(value)) is None or number.shape:
-                raise TypeError(f"the callback returned {value!r} under the name {name!r}: return real numbers by name")
-            if name in COLUMNS or name == "rate":
-                raise ValueError(f"the callback names a number {name!r}, as a column that is there: take another name")
-        return {name: float(value) for name, value in (returned or {}).items()}
-
-    return by_first_rank(V.mesh.comm, checked)

@@ -86,7 +86,8 @@ def _checked_functions(V: FunctionSpace, marked: npt.ArrayLike) -> npt.NDArray[n
     """Return marked functions as numbers, ascending."""
     functions = np.unique(np.asarray(marked))
     if functions.size and not np.issubdtype(functions.dtype, np.integer):
-        raise TypeError(f"marked functions must be integers (see adapt.mark), got {functions.dtype}")
+        marks = ": np.flatnonzero(marks) makes numbers of marks" * (functions.dtype == np.bool_)
+        raise TypeError(f"marked functions must be integers (see adapt.mark), got {functions.dtype}{marks}")
     if functions.size and (functions[0] < 0 or functions[-1] >= V.num_functions):
         raise ValueError(f"functions run from 0 to {V.num_functions - 1}; got {functions[0]} to {functions[-1]}")
     return functions.astype(np.int64)

@@ -51,7 +51,7 @@ Floats = npt.NDArray[np.float64]
 Fixed = Callable[[FunctionSpace], npt.ArrayLike | DirichletBC | Sequence[DirichletBC]]
 
 MEAN = 1e-3  # of a function, relative to that of absolute values of coefficients; quadrature leaves 1e-6
-FREE = 1e-10  # coefficient of a function that is more than rounding
+APART = 1e-6  # distance of two points that are not the same, relative to the size of the mesh
 HINTS = {
     "F": "it is the residual that uh solves, of linear problems a(uh, v) - L(v)",
     "J": "it is a number computed from uh, such as uh * dx(1)",
@@ -114,7 +114,7 @@ def goal(
     fine = middle = given.at(_carried(P, uh, W), W)
     in_W, in_V = _Prescribed.of(fixed, W), _Prescribed.of(fixed, V)
     (dofs, jump), (coarse_dofs, _) = in_W.at(fine.u), in_V.at(uh)
-    _check_found_anew(P, V, coarse_dofs, dofs, in_W.has_dofs_of(in_V))
+    _check_found_anew(V, W, in_V, in_W)
     fine.check_means(dofs)
     residual, change_of_goal = fine.residual(), fine.goal() - given.goal()
     if not fine.is_linear:
@@ -313,26 +313,23 @@ class _Prescribed:
         mine, others = ([bc.dofs for bc in each.bcs] for each in (self, other))
         return len(mine) == len(others) and all(map(np.array_equal, mine, others))
 
+    def points(self, V: FunctionSpace) -> Floats:
+        """Return where functions of V with the numbers are that this rank has been given, shape (n, gdim)."""
+        numbers = [bc.dofs // V.block_size for bc in self.bcs]
+        return V.reference_points[np.concatenate([np.zeros(0, dtype=np.int32), *numbers])]
 
-def _check_found_anew(P: Prolongation, V: FunctionSpace, coarse_dofs: Ints, dofs: Ints, same: bool) -> None:
+
+def _check_found_anew(V: FunctionSpace, W: FunctionSpace, in_V: _Prescribed, in_W: _Prescribed) -> None:
     """Raise if dofs that were found for V are taken for those of its refinement.
 
-    Args:
-        P: The prolongation to the refinement.
-        V: The space.
-        coarse_dofs: What is prescribed there.
-        dofs: What is prescribed in the refinement.
-        same: Whether `fixed` has returned the same numbers for both to this rank.
-
     Raises:
-        ValueError: It has on all ranks, but functions that are free in V have some of the prescribed dofs.
+        ValueError: Both have the same numbers on all ranks, but not where they are: that only functions of vertices of
+            V can have, at the vertex.
     """
-    if total(V.mesh.comm, int(not same)):
+    if total(V.mesh.comm, int(not in_W.has_dofs_of(in_V))):
         return
-    free = np.ones(V.num_local_dofs)
-    free[coarse_dofs] = 0.0
-    wrong = P(free.reshape(-1, V.block_size)).ravel()[dofs] > FREE
-    if total(V.mesh.comm, np.count_nonzero(wrong)):
+    distance = np.abs(in_W.points(W) - in_W.points(V)).max(initial=0.0)
+    if total(V.mesh.comm, int(distance > APART * np.ptp(V.mesh.vertices, axis=0).max())):
         raise ValueError(
             "fixed returned the same dofs for the space of uh and for its refinement, but they are others there: let "
             "it find them in the space that it is called with, as fem.boundary_dofs or lambda W: fem.boundary_dofs(W)"

@@ -29,11 +29,13 @@ def check_function(uh: object) -> None:
     Raises:
         TypeError: It is no function.
     """
-    if not isinstance(uh, Function):
-        several = " Of several unknowns give one at a time, and add their squares: np.hypot(eta_u, eta_p)"
+    wrong = f"uh is of type {type(uh).__name__}; it must be a fem.Function."
+    if isinstance(uh, list | tuple):
         raise TypeError(
-            f"uh is of type {type(uh).__name__}; it must be a fem.Function.{several * isinstance(uh, list | tuple)}"
+            f"{wrong} Of several unknowns give one at a time, and add their squares: np.hypot(eta_u, eta_p)"
         )
+    if not isinstance(uh, Function):
+        raise TypeError(wrong)
 
 
 def over_cells(V: FunctionSpace, integrals: ufl.Form) -> Floats:
