@@ -548,6 +548,24 @@ def test_uniform_refinement_is_a_rule() -> None:
     assert history["elements"].tolist() == [12, 48, 192]
 
 
+def test_a_rule_may_return_the_refined_space() -> None:
+    by_space = run(marking=lambda V, eta: adapt.refine(V, adapt.mark(V, eta)))
+    np.testing.assert_array_equal(by_space["dofs"], run()["dofs"])
+    assert run(marking=lambda V, eta: V).reason == "no function is marked, or none that can be refined"
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda V: fem.functionspace(V.mesh, ("THCCS", 3), boundary="crease"), "which is no refinement of"),
+        (lambda V: fem.functionspace(generators.torus((6, 4)), ("THCCS", 3)), "on another mesh, which is no refinem"),
+    ],
+)
+def test_a_space_that_is_no_refinement_is_refused(returned: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        run(marking=lambda V, eta: returned(V))
+
+
 # ---- Callbacks
 
 

@@ -5,15 +5,15 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from problems import singular
+from problems import poisson, singular
 from spaces import each_space, some_space, space
 
 import ufl
 from thccs_fem import adapt, estimate, fem, generators
-from thccs_fem.fem.scipy import LinearProblem
-from ufl import dx, grad, inner
+from ufl import grad
 
 Floats = npt.NDArray[np.float64]
+type Marking = adapt.Marking | adapt.MarkingAhead
 
 CORNER = (0.0, 0.0)
 
@@ -133,30 +133,51 @@ def test_rings_and_classes_are_kept() -> None:
 # ---- What it is for --------------------------------------------------------------------------------------------------
 
 
-def solutions_to(tolerance: float, predicted: bool) -> tuple[int, int]:
-    """Return how many problems are solved on the L-domain until the L2 error is small enough, and the last dofs."""
-    V, before = fem.functionspace(generators.l_domain(4), ("THCCS", 3)), None
+def on_the_l_domain(V: fem.FunctionSpace, marking: Marking, tolerance: float) -> adapt.History:
+    """Run until the L2 error is small enough, driven by the residual with one more power of h than in H1."""
     exact = singular(ufl.SpatialCoordinate(V.mesh))
-    for count in range(1, 60):
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        bc = fem.dirichletbc(exact, fem.boundary_dofs(V), V)
-        uh = LinearProblem(inner(grad(u), grad(v)) * dx, fem.Constant(V.mesh, 0.0) * v * dx, bcs=[bc]).solve()
-        if estimate.norm(V, estimate.error(uh, exact, "L2")) <= tolerance:
-            return count, V.num_dofs
-        eta = estimate.residual(uh, ufl.div(grad(uh))) * 2.0**-V.cells.level  # one power of h more than in H1
-        if predicted:
-            before = adapt.predict(V, eta, before, order=4.0)
-            V = before.refined()
-        else:
-            V = adapt.refine(V, adapt.mark(V, eta, theta=0.8))
-    raise AssertionError(f"the error is not {tolerance} after {count} steps")
+
+    def estimator(uh: fem.Function) -> tuple[Floats, float]:
+        V = uh.function_space
+        eta = estimate.residual(uh, ufl.div(grad(uh))) * 2.0**-V.cells.level
+        return eta, estimate.norm(V, estimate.error(uh, exact, "L2"))
+
+    def solve(V: fem.FunctionSpace) -> fem.Function:
+        return poisson(V, exact, fem.Constant(V.mesh, 0.0))
+
+    return adapt.solve(V, solve, estimator, marking=marking, stop=adapt.Stop(tolerance, steps=60), progress=False)
 
 
 def test_half_of_the_solutions_do_with_no_more_dofs() -> None:
-    count, dofs = solutions_to(2.5e-6, predicted=True)
-    one_by_one, fewest = solutions_to(2.5e-6, predicted=False)
-    assert 2 * count <= one_by_one
-    assert dofs <= 1.2 * fewest  # the last step may go beyond the tolerance, by up to 0.3
+    V = fem.functionspace(generators.l_domain(4), ("THCCS", 3))
+    ahead = on_the_l_domain(V, adapt.MarkingAhead(order=4.0), 2.5e-6)
+    one_by_one = on_the_l_domain(V, adapt.Marking(theta=0.8), 2.5e-6)
+    for history in (ahead, one_by_one):
+        assert abs(history["estimate"][-1]) <= 2.5e-6
+    assert 2 * len(ahead.steps) <= len(one_by_one.steps)
+    # The last step may go beyond the tolerance, by up to 0.3.
+    assert ahead["dofs"][-1] <= 1.2 * one_by_one["dofs"][-1]
+
+
+def test_marking_ahead_remembers_within_a_run_alone() -> None:
+    """As `predict` and `refined` by hand; in the next run, of a space that does not refine the last one, anew."""
+    V = start = fem.functionspace(generators.l_domain(4), ("THCCS", 3))
+    rule, before = adapt.MarkingAhead(order=4.0, reduction=0.4, theta=0.7), None
+    for _ in range(3):
+        eta = halved(V, 1.0)
+        before = adapt.predict(V, eta, before, order=4.0)
+        V, W = before.refined(0.4, 0.7), rule(V, eta)
+        assert W.hierarchy.same_as(V.hierarchy)
+    first = adapt.predict(start, halved(start, 1.0), order=4.0).refined(0.4, 0.7)
+    assert rule(start, halved(start, 1.0)).hierarchy.same_as(first.hierarchy)
+    torus = fem.functionspace(generators.torus((6, 4)), ("THCCS", 3))
+    assert rule(torus, np.ones(torus.num_cells)).num_dofs > torus.num_dofs
+
+
+@pytest.mark.parametrize("options", [{"order": 0.1}, {"reduction": 1.0}, {"theta": 0.0}])
+def test_marking_ahead_checks_its_arguments_at_once(options: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(options))} is "):
+        adapt.MarkingAhead(**options)
 
 
 # ---- What is refused -------------------------------------------------------------------------------------------------

@@ -107,6 +107,7 @@ SIGNATURES = {
     "adapt.mark": "V, eta, strategy='dorfler', theta=0.5",
     "adapt.solve": "V, problem, estimator, *, stop, marking=ANY, callback=None, progress=None, checkpoint=None",
     "adapt.Marking": "strategy='dorfler', theta=0.5",
+    "adapt.MarkingAhead": "order=3.0, reduction=0.3, theta=0.8",
     "adapt.predict": "V, eta, before=None, *, order=3.0",
     "adapt.Prediction.refined": "self, reduction=0.3, theta=0.8",
     "adapt.Stop": "tolerance=0.0, dofs=None, levels=None, seconds=None, steps=None",

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from thccs_fem.adapt.history import History, Step
 from thccs_fem.adapt.marking import Marking
-from thccs_fem.adapt.remeshing import refine
 from thccs_fem.adapt.resuming import Solution, begun, listed, resumed, save
-from thccs_fem.adapt.returned import check_called, estimated, numbers_of, reason_of
+from thccs_fem.adapt.returned import check_called, estimated, next_space, numbers_of, reason_of
 from thccs_fem.adapt.transfer import transfer
 from thccs_fem.fem.function import Function
 from thccs_fem.fem.space import FunctionSpace, check_space
@@ -48,7 +47,7 @@ def solve(
     problem: Callable[[FunctionSpace], Problem | Solution],
     estimator: Callable[[Any], npt.ArrayLike | tuple[npt.ArrayLike, float]],
     *,
-    marking: Callable[[FunctionSpace, Floats], npt.ArrayLike] = Marking(),  # noqa: B008  # frozen
+    marking: Callable[[FunctionSpace, Floats], npt.ArrayLike | FunctionSpace] = Marking(),  # noqa: B008  # frozen
     stop: Callable[[History], str | None],
     callback: Callable[[Step, Any], Mapping[str, float] | None] | None = None,
     progress: bool | None = None,
@@ -69,7 +68,8 @@ def solve(
             itself, a function or a list of those of several unknowns.
         estimator: Takes a solution, returns the indicator of each cell that this rank owns, shape (cells.num_owned,);
             or these and the estimate of the error, where that is not their norm. It may have a sign, as that of a goal.
-        marking: Takes the space and the indicators, returns the functions to refine, as `mark` does.
+        marking: Takes the space and the indicators, returns the functions to refine, as `mark` does; or the refined
+            space itself, as `MarkingAhead` does. What it remembers is in no checkpoint.
         stop: When to end, a `Stop`; or takes the history after each step, and returns why the run ends, or None.
         callback: Called after each step with the `Step` and the solution. It may return numbers by name, as
             ``{"error": 1e-4}``, which become columns of the history; those of rank 0 count.
@@ -97,7 +97,7 @@ def solve(
             start = time.perf_counter()
             try:
                 if run.history.steps:
-                    V = refine(run.V, marking(run.V, run.eta))
+                    V = next_space(run.V, marking(run.V, run.eta))
                     if V.num_cells == run.V.num_cells:
                         reason = "no function is marked, or none that can be refined"
                         break

@@ -22,7 +22,7 @@ from thccs_fem.hierarchy import Hierarchy
 from thccs_fem.sparse import csr, entries, product, rows_of, transposed
 from thccs_fem.subdivision import Ints
 
-__all__ = ["Prediction", "predict"]
+__all__ = ["MarkingAhead", "Prediction", "predict"]
 
 LEAST_RATE = 0.25  # something is gained by each refinement, or there would be no end to it
 MOST_ROUNDS = 8  # levels by which one step refines at the most
@@ -56,9 +56,7 @@ class Prediction:
         Raises:
             ValueError: If an argument is out of range.
         """
-        for name, value in (("reduction", reduction), ("theta", theta)):
-            if not (0.0 < value < 1.0 or (name == "theta" and value == 1.0)):
-                raise ValueError(f"{name} is {value}; it must lie between 0 and 1")
+        _check_shares(reduction, theta)
         hierarchy, squares = self.V.hierarchy.outlined(), self.eta**2
         least = reduction**2 * squares.sum() * (1.0 + TIE)
         for _ in range(MOST_ROUNDS):
@@ -98,8 +96,7 @@ def predict(
     check_space(V, "prediction")
     if not isinstance(before, Prediction | None):
         raise TypeError(f"before is of type {type(before).__name__}: give what predict has returned, or None")
-    if not order > LEAST_RATE:
-        raise ValueError(f"order is {order}; give the order of convergence for smooth solutions, 3 in H1, 4 in L2")
+    _check_order(order)
     of_cells = on_all_cells(V, eta)
     rates = np.full(of_cells.size, float(order))
     if before is not None:
@@ -111,6 +108,46 @@ def predict(
         rates = before.rates[cell]
         rates[finer] = np.clip(-np.log2(fall) / levels[finer], LEAST_RATE, order)
     return Prediction(V, of_cells, rates)
+
+
+class MarkingAhead:
+    """The marking of a loop that refines by several levels a solution: `predict`, then `Prediction.refined`.
+
+    It remembers the last prediction, for the rates. A run that goes on from a checkpoint does without, as at first.
+
+    Args:
+        order: See `predict`.
+        reduction: See `Prediction.refined`.
+        theta: See `Prediction.refined`.
+
+    Raises:
+        ValueError: If an argument is out of range.
+    """
+
+    def __init__(self, order: float = 3.0, reduction: float = 0.3, theta: float = 0.8):
+        _check_order(order)
+        _check_shares(reduction, theta)
+        self._order, self._reduction, self._theta = order, reduction, theta
+        self._last: Prediction | None = None
+
+    def __call__(self, V: FunctionSpace, eta: Floats) -> FunctionSpace:
+        """Return the refined space; collective."""
+        last = self._last
+        if last is not None and not V.hierarchy.is_refinement_of(last.V.hierarchy):  # of another run
+            last = None
+        self._last = predict(V, eta, last, order=self._order)
+        return self._last.refined(self._reduction, self._theta)
+
+
+def _check_order(order: float) -> None:
+    if not order > LEAST_RATE:
+        raise ValueError(f"order is {order}; give the order of convergence for smooth solutions, 3 in H1, 4 in L2")
+
+
+def _check_shares(reduction: float, theta: float) -> None:
+    for name, value in (("reduction", reduction), ("theta", theta)):
+        if not (0.0 < value < 1.0 or (name == "theta" and value == 1.0)):
+            raise ValueError(f"{name} is {value}; it must lie between 0 and 1")
 
 
 def _cells_around(coarse: Hierarchy, fine: Hierarchy) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

@@ -10,11 +10,12 @@ import numpy.typing as npt
 
 from thccs_fem import estimate
 from thccs_fem.adapt.history import COLUMNS
+from thccs_fem.adapt.remeshing import refine
 from thccs_fem.fem.space import FunctionSpace
-from thccs_fem.parallel import by_first_rank, largest, smallest, together, total
+from thccs_fem.parallel import by_first_rank, largest, size_of, smallest, together, total
 from thccs_fem.partition import partition
 
-__all__ = ["check_called", "estimated", "numbers_of", "reason_of"]
+__all__ = ["check_called", "estimated", "next_space", "numbers_of", "reason_of"]
 
 Floats = npt.NDArray[np.float64]
 
@@ -81,6 +82,22 @@ def _real(given: Any) -> Floats | None:
     except ValueError:  # of lists of arrays, say
         return None
     return array.astype(np.float64) if array.dtype.kind in "biuf" else None
+
+
+def next_space(V: FunctionSpace, returned: Any) -> FunctionSpace:
+    """Return the space that the marking has returned, or V refined where it has marked functions."""
+    num_spaces = total(V.mesh.comm, int(isinstance(returned, FunctionSpace)))
+    if not num_spaces:
+        return refine(V, returned)
+    if num_spaces < size_of(V.mesh.comm):
+        raise ValueError("the marking returned a space on some ranks, functions on others: return the same on all")
+    if returned.mesh is not V.mesh or not returned.hierarchy.is_refinement_of(V.hierarchy):
+        elsewhere = " on another mesh" if returned.mesh is not V.mesh else ""
+        raise ValueError(
+            f"the marking returned {returned}{elsewhere}, which is no refinement of {V}: return functions of that to "
+            f"refine, or a space that adapt.refine or a Prediction has made of it"
+        )
+    return returned
 
 
 def reason_of(V: FunctionSpace, returned: object) -> str | None:
