@@ -16,6 +16,7 @@ from compared import same_as_in_serial
 from thccs_fem import adapt, fem, generators, io, plot, vtk
 from thccs_fem.fem.space import CellwiseSpace, FunctionSpace
 from thccs_fem.mesh import ControlMesh
+from thccs_fem.plot import pictures
 
 EXACT = 1e-14  # the same operators and sums; where pieces are cut from others, in another order
 MESHES: dict[str, Callable[[MPI.Comm], ControlMesh]] = {
@@ -228,6 +229,6 @@ def test_picture_that_can_not_be_drawn_is_told_by_all(
     def fails(*_: object) -> None:
         raise OSError("no display")
 
-    monkeypatch.setattr(plot, "_check_there_is_something_to_draw_on", fails)
+    monkeypatch.setattr(pictures, "_check_there_is_something_to_draw_on", fails)
     with pytest.raises(OSError, match=r"^no display$"):
         plot.plot(refined(MESHES["wheel"](comm)), folder / "u.png")
