@@ -228,6 +228,29 @@ class Hierarchy:
         """Number of active functions."""
         return int(self.dof_offsets[-1])
 
+    @cached_property
+    def cells(self) -> tuple[Keys, Keys]:
+        """Level and key of each cell (active element), in the order of their numbers, each of shape (num_cells,)."""
+        keys = [stage.level.keys[stage.active_faces] for stage in self.stages[: self.num_levels]]
+        return np.repeat(np.arange(len(keys)), [k.size for k in keys]), np.concatenate(keys)
+
+    def cells_around(self, levels: Keys, keys: Keys) -> tuple[Keys, Keys]:
+        """Return the cell that each of some faces is or lies in, and its level, each of shape (n,).
+
+        Where cells are finer than the face it is the first of those in it. Cells are ranges of the keys of their parts
+        on the finest level.
+
+        Args:
+            levels: Level of each face, shape (n,).
+            keys: Its key there, shape (n,).
+        """
+        own_levels, own_keys = self.cells
+        depth = max(self.num_levels - 1, int(levels.max(initial=0)))
+        begins = own_keys << 2 * (depth - own_levels)
+        order = np.argsort(begins)
+        cell = order[np.searchsorted(begins[order], keys << 2 * (depth - levels), side="right") - 1]
+        return cell, own_levels[cell]
+
     def dof_functions(self, level: int) -> Ints:
         """Return the functions of a level that are dofs, in dof order."""
         return np.flatnonzero(self.stages[level].active).astype(np.int32)

@@ -175,17 +175,14 @@ def _supports(cells: Cells) -> sp.csr_array:
 
 def _everywhere(hierarchy: Hierarchy) -> Partition:
     """Return the numbers of a rank that works on all cells and functions, as each does where that is little."""
-    cells = sum(stage.active_faces.size for stage in hierarchy.stages[: hierarchy.num_levels])
-    return Partition(IndexMap.whole(cells), IndexMap.whole(hierarchy.num_dofs), 1.0)
+    return Partition(IndexMap.whole(hierarchy.cells[0].size), IndexMap.whole(hierarchy.num_dofs), 1.0)
 
 
 def _rings(hierarchy: Hierarchy) -> sp.csr_array:
     """Return the incidence of functions and the cells in their rings, shape (num_dofs, number of cells), entries 1."""
-    stages = hierarchy.stages[: hierarchy.num_levels]
-    keys = np.concatenate([stage.level.keys[stage.active_faces] for stage in stages])
-    levels = np.repeat(np.arange(len(stages)), [stage.active_faces.size for stage in stages])
+    levels, keys = hierarchy.cells
     rows, columns = [], []
-    for l, stage in enumerate(stages):
+    for l, stage in enumerate(hierarchy.stages[: hierarchy.num_levels]):
         cells = np.flatnonzero(levels >= l)
         faces = np.searchsorted(stage.level.keys, keys[cells] >> 2 * (levels[cells] - l))  # that cells are, or lie in
         dofs = _dofs_at_vertices(stage, int(hierarchy.dof_offsets[l]))[stage.level.quads[faces]].reshape(cells.size, -1)

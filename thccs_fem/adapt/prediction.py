@@ -151,22 +151,9 @@ def _check_shares(reduction: float, theta: float) -> None:
 
 
 def _cells_around(coarse: Hierarchy, fine: Hierarchy) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return for each cell of a refinement the cell that it is or lies in, and how many levels coarser that is.
-
-    Cells are ranges of the keys of their parts on the finest level.
-    """
-    begins, levels = _key_ranges(coarse, fine.num_levels - 1)
-    fine_begins, fine_levels = _key_ranges(fine, fine.num_levels - 1)
-    order = np.argsort(begins)
-    cell = order[np.searchsorted(begins[order], fine_begins, side="right") - 1]
-    return cell, fine_levels - levels[cell]
-
-
-def _key_ranges(hierarchy: Hierarchy, depth: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the first key that each cell has on level `depth`, and the cell's level."""
-    stages = hierarchy.stages[: hierarchy.num_levels]
-    begins = [stage.level.keys[stage.active_faces] << 2 * (depth - l) for l, stage in enumerate(stages)]
-    return np.concatenate(begins), np.repeat(np.arange(len(begins)), [b.size for b in begins])
+    """Return for each cell of a refinement the cell that it is or lies in, and how many levels coarser that is."""
+    cell, levels = coarse.cells_around(*fine.cells)
+    return cell, fine.cells[0] - levels
 
 
 def _marked(hierarchy: Hierarchy, squares: Floats, theta: float) -> npt.NDArray[np.int64]:

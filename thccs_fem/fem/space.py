@@ -283,22 +283,16 @@ class CellwiseSpace(ufl.FunctionSpace, _OnRanks):
             return cells.face
         if cells.hierarchy is self.hierarchy:
             return cells.partition.cells.numbers
-        found = np.full(cells.num_cells, -1, dtype=np.int32)
-        keys = _cell_keys(cells)
-        first = 0
-        for l, stage in enumerate(self.hierarchy.stages[: self.hierarchy.num_levels]):
-            known = stage.level.keys[stage.active_faces]
-            ancestor = keys >> 2 * np.maximum(cells.level.astype(np.int64) - l, 0)
-            place = np.minimum(np.searchsorted(known, ancestor), known.size - 1)
-            inside = (cells.level >= l) & (known[place] == ancestor) if known.size else np.zeros(keys.size, dtype=bool)
-            found[inside] = first + place[inside]
-            first += known.size
-        if (found < 0).any():
+        numbers = cells.partition.cells.numbers
+        levels, keys = (of_all[numbers] for of_all in cells.hierarchy.cells)
+        found, around = self.hierarchy.cells_around(levels, keys)
+        num_coarser = np.count_nonzero(around > levels)
+        if num_coarser:
             raise ValueError(
-                f"the values of {np.count_nonzero(found < 0)} of {found.size} cells are not known: a function that is "
+                f"the values of {num_coarser} of {found.size} cells are not known: a function that is "
                 f"constant on cells goes over to finer cells only"
             )
-        return found
+        return found.astype(np.int32)
 
     def __eq__(self, other: object) -> bool:
         if self is other:
@@ -435,15 +429,6 @@ def _checked_shape(shape: object) -> tuple[int, ...]:
     if not isinstance(shape, tuple) or len(shape) > 1 or not all(isinstance(k, int) and k > 0 for k in shape):
         raise ValueError(f"the value shape is {shape!r}; it must be () or (k,) with k components")
     return shape
-
-
-def _cell_keys(cells: Cells) -> npt.NDArray[np.int64]:
-    """Return the key of each cell on its level, shape (num_cells,)."""
-    keys = np.zeros(cells.num_cells, dtype=np.int64)
-    for l in range(cells.hierarchy.num_levels):
-        here = cells.level == l
-        keys[here] = cells.hierarchy.stages[l].level.keys[cells.level_face[here]]
-    return keys
 
 
 def _limit_points(hierarchy: Hierarchy, l: int) -> npt.NDArray[np.float64]:
